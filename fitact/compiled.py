@@ -13,6 +13,7 @@ import contextlib
 import functools
 import hashlib
 import importlib.metadata
+import math
 import os
 import pickle
 import platform
@@ -73,6 +74,14 @@ def pad_rows(values: np.ndarray, size: int, axis: int = 0) -> np.ndarray:
     if not missing:
         return values
     return np.concatenate([values, np.repeat(np.take(values, [-1], axis), missing, axis)], axis)
+
+
+def empty_aligned(shape: tuple[int, ...]) -> np.ndarray:
+    """Return an array in double precision, aligned to 64 bytes so that JAX can use it without a copy."""
+    size = math.prod(shape)
+    memory = np.empty(size + 8)
+    first = -memory.ctypes.data % 64 // 8
+    return memory[first : first + size].reshape(shape)
 
 
 def as_arrays(module: _Module) -> _Module:
@@ -352,6 +361,17 @@ def processor() -> str:
 def available_cores() -> int:
     """Return the number of cores that this process may use, as far as the system tells."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def map_blocks(function: Callable[..., _Result], rows: Any, block: int) -> _Result:
+    """Return `function` of each row of arrays, within a program.
+
+    A CPU computes `block` rows at once, so few that its cache holds them and that XLA does not split its loops among
+    threads, which compute other batches. Another device computes all at once.
+    """
+    if find_device().platform == "cpu":
+        return lax.map(function, rows, batch_size=block)
+    return jax.vmap(function)(rows)
 
 
 class BatchEvaluator:

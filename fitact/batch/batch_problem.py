@@ -12,14 +12,15 @@ from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from fitact.batch.gauss_newton import CANDIDATES, GaussNewton
+from fitact.compiled import empty_aligned
 from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record, white_noise_sds
 from fitact.fitting.derived import DerivedQuantities
 from fitact.fitting.least_squares import NUISANCES, bic_decrease
-from fitact.fitting.residual_tests import PhaseBins, count_true
+from fitact.fitting.residual_tests import PhaseBins
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.problem.starting_point import most_probable_skin, prior_skin_moments
@@ -72,7 +73,7 @@ class Screening(NamedTuple):
         noise, low, high = white_noise_sds(values), values.min(axis=1), values.max(axis=1)
         steps = np.abs(np.diff(values[:, : settings.adc_samples], axis=1))
         fine = np.any((steps > 0.0) & (steps <= noise[:, None]), axis=1)
-        extremes = [count_true(values == extreme[:, None]) > settings.max_rail_samples for extreme in (low, high)]
+        extremes = [_count_true(values == extreme[:, None]) > settings.max_rail_samples for extreme in (low, high)]
         railed = np.any(extremes, axis=0)
         railed[railed] = [clipping_mask(row).any() for row in values[railed]]  # takes long, so of few
         return cls(noise, high - low, fine, railed)
@@ -144,9 +145,16 @@ class BatchProblem(abc.ABC):
         return gains
 
 
+def _count_true(mask: Bool[np.ndarray, "*rows n"]) -> Int[np.ndarray, "*rows"]:
+    """Return the number of true values in each row, summed in the smallest integer type, which is fastest."""
+    return mask.view(np.uint8).sum(axis=-1, dtype=np.min_scalar_type(mask.shape[-1])).astype(int)
+
+
 def stack_channel(records: Sequence[Record], channel: str) -> Float[np.ndarray, "records samples"]:
     """Return a channel of all records; one large array, since many smaller ones take new memory again and again."""
-    return np.concatenate([record[channel] for record in records]).reshape(len(records), -1)  # faster than `np.stack`
+    stacked = empty_aligned((len(records), len(records[0])))
+    np.concatenate([record[channel] for record in records], out=stacked.reshape(-1))  # faster than `np.stack`
+    return stacked
 
 
 def split_rows(rows: _Rows, size: int) -> list[_Rows]:

@@ -33,6 +33,7 @@ from fitact.progress import track_progress
 from fitact.scene.scene import Scene
 
 _GROUP_RECORDS = 256  # records that are collected for batches
+_SINGLE_RECORDS = 8  # records of a job in which each is fitted separately
 _UNTESTED_MESSAGE = (
     "The fit converged, and the residuals are no larger than the noise; they were not tested for structure."
 )
@@ -170,9 +171,12 @@ def tabulate_records(
 
 
 def _fit_rows(batches: Iterable[Batch], scene: Scene | None, whiteness: bool) -> Iterator[tuple[int, Row]]:
-    for (_, members), (rows, _) in run_in_threads(batches, functools.partial(fit_batch, whiteness=whiteness)):
-        for number, record in members:
-            yield number, rows[number] if number in rows else _fit_single(record, scene)
+    def fit_members(batch: Batch) -> dict[int, Row]:
+        rows, _ = fit_batch(batch, whiteness)
+        return {number: rows.get(number) or _fit_single(record, scene) for number, record in batch[1]}
+
+    for _, rows in run_in_threads(batches, fit_members):
+        yield from rows.items()
 
 
 def _read_records(
@@ -276,7 +280,8 @@ def _split_group(group: RecordGroup, scene: Scene | None) -> Iterator[Batch]:
         for members in split_rows(list(itertools.compress(group.members, alike)), group.batch_problem.unit):
             yield group.batch_problem, members
         group.members = [member for member, same in zip(group.members, alike, strict=True) if not same]
-    yield None, group.members
+    for members in split_rows(group.members, _SINGLE_RECORDS):
+        yield None, members
     group.members = []
 
 

@@ -14,7 +14,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from fitact.compiled import jit
+from fitact.compiled import jit, map_blocks
 from fitact.fitting.least_squares import NUISANCES
 from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
 from fitact.likelihood.compression import Compression
@@ -39,8 +39,7 @@ class GaussNewton:
         clock_bic_error: error of the BIC difference for a clock error, whose regressor is only approximate here.
         adc_samples: number of samples used to decide whether noise exceeds the LSB of the ADC.
         max_rail_samples: number of samples at an extreme from which saturation is suspected.
-        block: number of records that a program computes at once, so few that XLA does not split its loops among
-            threads, which compute other batches.
+        block: see `map_blocks`.
     """
 
     max_samples: int = 65_536
@@ -121,7 +120,7 @@ def find_optima(
     the relative change of sigma in the last step.
     """
     find = functools.partial(_find_optimum, likelihood, settings, clock, tolerance)
-    return lax.map(lambda each: find(*each), (records, start, noise), batch_size=settings.block)
+    return map_blocks(lambda each: find(*each), (records, start, noise), settings.block)
 
 
 def _find_optimum(
@@ -148,8 +147,8 @@ def _find_optimum(
     def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
         theta, sigma, _, steps = state
         residuals, jacobian = linearise(theta, sigma)
-        r_factor, projections = _qr_decompose(jacobian, residuals)
-        move = -_back_substitute(r_factor, projections)
+        r_factor, projections = decompose_qr(jacobian, residuals)
+        move = -substitute_back(r_factor, projections)
         move = move * jnp.minimum(1.0, settings.max_log_change / jnp.max(jnp.abs(move)))
         # of the residuals after this step, if the model is linear
         rms = sigma * jnp.linalg.norm((residuals + jacobian @ move)[:rows]) / jnp.sqrt(channel.count - size)
@@ -163,7 +162,7 @@ def _find_optimum(
 
     theta, sigma, _, _ = lax.while_loop(should_continue, step, (start, noise, jnp.array(jnp.inf), jnp.array(0)))
     whitened, jacobian = linearise(theta, sigma)
-    residuals, (r_factor, projections) = sigma * whitened[:rows], _qr_decompose(jacobian, whitened)
+    residuals, (r_factor, projections) = sigma * whitened[:rows], decompose_qr(jacobian, whitened)
     is_possible = jnp.isfinite(model.log_prob(jnp.append(theta, jnp.log(sigma))))
     r_squared = _r_squared(channel, model.channel_inputs(theta), clock, residuals, jacobian[:rows])
     fitted, converged = channel.whitened_observed() - residuals, jnp.linalg.norm(projections) <= settings.tolerance
@@ -203,13 +202,13 @@ def _orthonormalise(columns: list[Array], min_lengths: Sequence[ArrayLike]) -> l
     return list(basis)
 
 
-def _qr_decompose(jacobian: Float[Array, "rows n"], residuals: Array) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+def decompose_qr(jacobian: Float[Array, "rows n"], residuals: Array) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
     """Return R and Q^T residuals of a QR decomposition; it vectorises over many small matrices, unlike LAPACK."""
     q = jnp.stack(_orthonormalise(list(jacobian.T), [0.0] * jacobian.shape[1]))
     return jnp.triu(q @ jacobian), q @ residuals
 
 
-def _back_substitute(r_factor: Float[Array, "n n"], rhs: Float[Array, " n"]) -> Float[Array, " n"]:
+def substitute_back(r_factor: Float[Array, "n n"], rhs: Float[Array, " n"]) -> Float[Array, " n"]:
     solution = jnp.zeros_like(rhs)
     for i in reversed(range(rhs.size)):
         solution = solution.at[i].set((rhs[i] - r_factor[i] @ solution) / r_factor[i, i])

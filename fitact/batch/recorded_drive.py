@@ -14,13 +14,23 @@ from jaxtyping import Array, Bool, Float
 
 from fitact.batch.batch_problem import BatchFit, BatchProblem, Screening, stack_channel
 from fitact.batch.gauss_newton import GaussNewton, GaussNewtonResult, RecordInputs, find_optima
-from fitact.batch.recorded_tables import AGES, HALF_WIDTH, TABLE_NODES, SharedFunctions, Tables, to_response_table
-from fitact.compiled import jit
+from fitact.batch.recorded_tables import (
+    AGES,
+    HALF_WIDTH,
+    RECORD_BLOCK,
+    TABLE_NODES,
+    SharedFunctions,
+    Tables,
+    table_nodes,
+    to_response_table,
+)
+from fitact.batch.shared_basis import SAMPLE_BLOCK
+from fitact.compiled import jit, map_blocks
 from fitact.data.record import Record, rounding_noise_sd
 from fitact.fitting.derived import DerivedQuantities
 from fitact.fitting.least_squares import MIN_BIC_DECREASE, NUISANCES, bic_decrease_from_z
 from fitact.fitting.residual_statistics import interpolation_errors, is_misfit, residual_statistics
-from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics
+from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics, sum_rows
 from fitact.fitting.result import Fit
 from fitact.likelihood.channel import LINEAR_NUISANCES
 from fitact.likelihood.compression import Compression
@@ -28,7 +38,6 @@ from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.projection import MAX_DELAY, is_exactly_uniform
 from fitact.model.circuit import passes_direct_current
 from fitact.model.force import force_constant
-from fitact.model.response_table import TABLE_HALF_WIDTH
 from fitact.model.skin import WithSkin
 from fitact.problem.build import MIN_RELATIVE_NOISE, Problem, edge_gain_sd
 from fitact.problem.drive_choice import has_unresolved_edge, has_unresolved_edges
@@ -59,7 +68,7 @@ class RecordedDriveProblem(BatchProblem):
             the drive does not repeat.
     """
 
-    unit, settings = 64, GaussNewton(block=32)
+    unit, settings = 128, GaussNewton(block=32)
     shared: SharedFunctions
     linear_sd: Float[np.ndarray, " nuisances"]
     gain_sd: float
@@ -86,7 +95,7 @@ class RecordedDriveProblem(BatchProblem):
         origin, margin = round(delay / float(trace.time_step)), MAX_DELAY if trace.timing else 0
         shared = SharedFunctions.from_times(time, margin, float(tau[0]), origin)
         counted = np.flatnonzero(trace.weights[: time.size] == 1.0)
-        if abs(origin) > MAX_DELAY - AGES or not np.array_equal(counted, np.arange(time.size)[shared.used]):
+        if abs(origin) > MAX_DELAY - AGES or not np.array_equal(counted, np.arange(margin, time.size - margin)):
             return None
         optional = tuple(name for name in problem.sources[0].optional_nuisances if name not in trace.timing)
         linear_sd = np.asarray(problem.likelihood.channels[0].linear_sd) / np.ptp(record["Vsc"])
@@ -106,7 +115,7 @@ class RecordedDriveProblem(BatchProblem):
         return cls(
             likelihood=likelihood.replace_channel(0, trace),
             derive=fitted.derive,
-            phases=PhaseBins.from_times(time[shared.used], frequency),
+            phases=PhaseBins.from_times(time[counted], frequency),
             samples=counted.size,
             optional_nuisances=optional,
             shared=shared,
@@ -124,48 +133,51 @@ class RecordedDriveProblem(BatchProblem):
     def fit(self, records: Sequence[Record], whiteness: bool = True) -> BatchFit:
         """Fit `unit` records, and optionally test the residuals for structure (`whiteness`), in double precision."""
         V, Vsc = stack_channel(records, "V"), stack_channel(records, "Vsc")
+        tables = Tables.from_records(self.shared, V, Vsc)
         driven, screened = Screening.from_values(V, self.settings), Screening.from_values(Vsc, self.settings)
-        g, b, accepted = self._estimate_start(V, Vsc)
-        tables = Tables.from_records(self.shared, V, Vsc, b)
         gain_sd = None
         if "gain" in self.names:
-            gain_sd = np.hypot(self.gain_sd, edge_gain_sd(self.shared.time_step, b) if self.unresolved else 0.0 * b)
-        inputs, optima = self._find_optima(tables, self.starting_points(g, b), screened, gain_sd)
+            edges = edge_gain_sd(float(self.shared.time_step), tables.b) if self.unresolved else np.zeros(len(V))
+            gain_sd = np.hypot(self.gain_sd, edges)
+        inputs, optima = self._find_optima(tables, self.starting_points(tables.g, tables.b), screened, gain_sd)
         raw = inputs._replace(table=self._select(tables.fields(in_functions=True)))
         optimum = _evaluate_optima(self.derive, self.likelihood, inputs, raw, optima.theta, optima.sigma)
-        residuals = tables.residuals(optimum.fitted)
-        square, factor = np.vecdot(residuals, residuals), np.linalg.inv(optima.r_factor)
-        figures = self._figures(V, driven, screened, residuals, square, inputs.linear_sd, optimum.gain, whiteness)
+        weight = self.derive.weight[: self.evaluated.stop - self.evaluated.start]
+        contact = weight, self.derive.coefficient, self.derive.normal_force
+        square, tests, logs, gradients = _evaluate_records(
+            self.shared, self.phases, self.evaluated.start, contact, whiteness, tables.b, optimum, V, Vsc
+        )
+        figures = self._figures(V, driven, screened, square, tests, inputs.linear_sd, optimum.gain)
+        factor = np.linalg.inv(optima.r_factor)
         loss = np.abs(optima.sum_of_squares - square)
-        accepted &= screened.fine & ~screened.railed & self._is_whole_drive(V, driven)
+        accepted = tables.is_possible & screened.fine & ~screened.railed & self._is_whole_drive(V, driven)
         accepted &= optima.converged & (loss <= self.settings.max_rounding_loss * square) & ~is_misfit(figures)
         accepted &= np.max(self.bic_decreases(optima.r_squared), axis=1) <= MIN_BIC_DECREASE
         accepted &= self._needs_delay(optima.theta, factor)
         freed = np.array([self._nuisance_names(free) for free in inputs.linear_sd > 0.0])
-        derived = self._derive(tables, optimum)
         prior = np.array(np.broadcast_to(self.prior_factor, factor.shape))
         if gain_sd is not None:
             place = self.names.index("gain")
             prior[:, place, place] = gain_sd
-        return BatchFit(accepted, tables.observed, optima.theta, optima.sigma, factor, prior, *derived, figures, freed)
+        return BatchFit(
+            accepted, tables.observed, optima.theta, optima.sigma, factor, prior, logs, gradients, figures, freed
+        )
 
     def _figures(
         self,
         V: Float[np.ndarray, "records samples"],
         driven: Screening,
         screened: Screening,
-        residuals: Float[np.ndarray, "records used"],
         square: Float[np.ndarray, " records"],
+        tests: ResidualTestStatistics | None,
         linear_sd: Float[np.ndarray, "records nuisances"],
         gain: Float[np.ndarray, " records"],
-        whiteness: bool,
     ) -> dict[str, np.ndarray]:
         """Return the figures of merit; compare `fitact.fitting.residual_statistics.channel_statistics`."""
         # the ADC's steps, which take long to find, are looked for only where they may exceed the noise
         rounding = np.array([0.0 if fine else rounding_noise_sd(v) for v, fine in zip(V, driven.fine, strict=True)])
         expected = np.hypot(screened.noise, gain * np.hypot(driven.noise, rounding))
         freedom = self.samples - len(self.names) - np.count_nonzero(linear_sd, axis=1)
-        tests = ResidualTestStatistics.from_residuals(residuals.astype(np.float32), self.phases) if whiteness else None
         figures = residual_statistics(square, self.samples, tests, expected, freedom, self.phases)
         interpolation = gain * interpolation_errors(V, driven.noise)
         return figures | {"rounding_noise": np.zeros(len(V)), "interpolation_error": interpolation}
@@ -182,33 +194,6 @@ class RecordedDriveProblem(BatchProblem):
             change = np.max(np.abs(V[:, self.repeat :] - V[:, : -self.repeat]), axis=1)
             whole &= change <= largest + 10.0 * driven.noise
         return whole
-
-    def _estimate_start(
-        self, V: Float[np.ndarray, "records samples"], Vsc: Float[np.ndarray, "records samples"], stride: int = 3
-    ) -> tuple[Float[np.ndarray, " records"], Float[np.ndarray, " records"], Bool[np.ndarray, " records"]]:
-        """Estimate g and b (s) from Vsc = g V - (1/b) ∫ Vsc dt + line, with V delayed, and whether it is possible.
-
-        One sample of `stride` suffices; even strides would meet the same phases of most drives again.
-        """
-        integral, origin = np.cumsum(Vsc, axis=1) - 0.5 * Vsc, self.shared.origin
-        inside = slice(MAX_DELAY, V.shape[1] - MAX_DELAY, stride)
-        shifts = (slice(inside.start + k, inside.stop + k, stride) for k in range(-origin - 1, -origin + 2))
-        before, moved, after = (V[:, each] for each in shifts)
-        line = np.broadcast_to(np.linspace(-1.0, 1.0, moved.shape[1]), moved.shape)
-        # steps of the drive around a sample represent a delay by a fraction of a step
-        columns = moved, integral[:, inside], moved - before, after - moved, np.ones_like(line), line, Vsc[:, inside]
-        rows = np.stack(columns, axis=1)
-        products = rows @ np.swapaxes(rows, 1, 2)
-        scale = np.sqrt(np.einsum("rii->ri", products))
-        scale[scale == 0.0] = 1.0
-        products /= scale[:, :, None] * scale[:, None, :]
-        normal = products[:, :-1, :-1] + np.finfo(float).eps * np.eye(len(columns) - 1)
-        solution = np.linalg.solve(normal, products[:, :-1, -1:])[:, :2, 0] * scale[:, -1:] / scale[:, :2]
-        g, rate = solution[:, 0], -solution[:, 1] / self.shared.time_step
-        log_b = -np.log(np.maximum(rate, np.finfo(float).tiny))
-        is_possible = (g > 0.0) & (g < 0.5) & (log_b > math.log(3.0 * self.shared.time_step))
-        is_possible &= np.abs(log_b - self.shared.center) < TABLE_HALF_WIDTH - HALF_WIDTH
-        return np.where(is_possible, g, 0.1), np.exp(np.where(is_possible, log_b, self.shared.center)), is_possible
 
     def _find_optima(
         self,
@@ -256,45 +241,6 @@ class RecordedDriveProblem(BatchProblem):
         names = itertools.compress(LINEAR_NUISANCES, is_free)
         return ", ".join([*names, *(name for name in self.names if name in ("gain", "delay"))])
 
-    def _derive(
-        self, tables: Tables, optimum: ModelCoefficients
-    ) -> tuple[Float[np.ndarray, "records derived"], Float[np.ndarray, "records derived parameters"]]:
-        """Return the logarithms of the quantities of `DERIVED_NAMES`, and their gradients in theta."""
-        size, count = self.shared.size, self.evaluated.stop - self.evaluated.start
-        weight = np.asarray(self.derive.weight)[:count]
-        # the voltage is not delayed, so that the steps of the drive have no part in it
-        own, shared = tables.own[:, :TABLE_NODES, self.evaluated], self.shared.functions[self.evaluated]
-        last = size + TABLE_NODES
-        coefficients, slopes = optimum.voltage[:, :last], optimum.voltage_slopes[:, :last]
-        voltage = (coefficients[:, None, size:] @ own)[:, 0] + coefficients[:, :size] @ shared.T
-        square = voltage * voltage
-        peak, mean, fourth = np.argmax(square, axis=1), square @ weight, np.square(square) @ weight
-        # inner products of the functions with V and V^3 give the slopes of the means of V^2 and V^4
-        weighted = np.stack([weight * voltage, weight * voltage * square], axis=1)
-        moments = [(weighted.reshape(-1, count) @ shared).reshape(len(own), 2, size), weighted @ np.swapaxes(own, 1, 2)]
-        mean_slope, fourth_slope = np.moveaxis(np.concatenate(moments, axis=2) @ slopes, 1, 0)
-        records = np.arange(len(own))
-        at_peak = np.concatenate([shared[peak], own[records, :, peak]], axis=1)
-        peak_slope = np.einsum("rf,rfp->rp", at_peak, slopes) / voltage[records, peak, None]
-        scale, scale_slope = optimum.logs[:, 2], optimum.log_slopes[:, 2]
-        force, force_slope = np.exp(scale) * mean, scale_slope + 2.0 * mean_slope / mean[:, None]
-        total = force + float(self.derive.normal_force)
-        logs = [
-            *optimum.logs[:, :2].T,
-            np.log(force),
-            scale + np.log(square[records, peak]),
-            scale + 0.5 * np.log(fourth),
-            np.log(float(self.derive.coefficient) * total),
-        ]
-        gradients = [
-            *np.moveaxis(optimum.log_slopes[:, :2], 1, 0),
-            force_slope,
-            scale_slope + 2.0 * peak_slope,
-            scale_slope + 2.0 * fourth_slope / fourth[:, None],
-            force_slope * (force / total)[:, None],
-        ]
-        return np.stack(logs, axis=1), np.stack(gradients, axis=1)
-
 
 @functools.partial(jit, fast=True)
 def _evaluate_optima(
@@ -334,3 +280,65 @@ def _evaluate_optimum(
     (voltage_slopes, log_slopes), (voltage, logs) = jax.jacfwd(quantities, has_aux=True)(theta)
     gain = jnp.abs(sum(inputs.circuit.channel_terms(channel.channel).weight))
     return ModelCoefficients(fitted, voltage, voltage_slopes, logs, log_slopes, gain)
+
+
+@functools.partial(jit, fast=True)
+def _evaluate_records(
+    shared: SharedFunctions,
+    phases: PhaseBins | None,
+    begin: int,
+    contact: tuple[Array, Array, Array],
+    whiteness: bool,
+    tau: Float[Array, " records"],
+    optima: ModelCoefficients,
+    V: Float[Array, "records samples"],
+    Vsc: Float[Array, "records samples"],
+) -> tuple[Array, ResidualTestStatistics | None, Array, Array]:
+    """Return the residual sums of squares, statistics of the residual tests, and the moments of `_derive_record`."""
+
+    def evaluate_record(record: tuple[Array, ModelCoefficients, Array, Array]) -> tuple[Array, Array, Array]:
+        center, optimum, v, vsc = record
+        own = shared.filter_drive(v, vsc, table_nodes(center))
+        shared_part, own_part = jnp.split(optimum.fitted, [shared.size])
+        model = shared_part @ shared.fitted_functions + sum(c * row for c, row in zip(own_part, own, strict=False))
+        # the voltage is not delayed, so that the steps of the drive have no part in it
+        times = slice(begin, begin + contact[0].size)
+        forces = _derive_record(own[:TABLE_NODES, times], shared.functions[:, times], contact, optimum)
+        return shared.select_fitted(own[-1] - model), *forces
+
+    residuals, logs, gradients = map_blocks(evaluate_record, (tau, optima, V, Vsc), RECORD_BLOCK)
+    test = functools.partial(ResidualTestStatistics.from_residuals, phase_bins=phases)
+    tests = map_blocks(test, residuals.astype(jnp.float32), SAMPLE_BLOCK) if whiteness else None
+    return sum_rows(residuals * residuals), tests, logs, gradients
+
+
+def _derive_record(
+    own: Float[Array, "nodes times"],
+    shared: Float[Array, "shared times"],
+    contact: tuple[Array, Array, Array],
+    optimum: ModelCoefficients,
+) -> tuple[Float[Array, " derived"], Float[Array, "derived parameters"]]:
+    """Return the logarithms of the quantities of `DERIVED_NAMES`, and their gradients in theta."""
+    (weight, coefficient, normal_force), size = contact, len(shared)
+    coefficients, slopes = (x[: size + len(own)] for x in (optimum.voltage, optimum.voltage_slopes))
+    voltage = coefficients[:size] @ shared + sum(c * row for c, row in zip(coefficients[size:], own, strict=True))
+    square = voltage * voltage
+    # faster than `argmax`
+    peak = jnp.min(jnp.where(square == jnp.max(square), np.arange(square.size), square.size - 1))
+    mean, fourth = square @ weight, jnp.square(square) @ weight
+    # inner products of the functions with V and V^3 give the slopes of the means of V^2 and V^4
+    weighted = jnp.stack([weight * voltage, weight * voltage * square])
+    mean_slope, fourth_slope = jnp.concatenate([shared @ weighted.T, own @ weighted.T]).T @ slopes
+    peak_slope = jnp.concatenate([shared[:, peak], own[:, peak]]) @ slopes / voltage[peak]
+    (log_g, log_b, scale), (g_slope, b_slope, scale_slope) = optimum.logs, optimum.log_slopes
+    force, force_slope = jnp.exp(scale) * mean, scale_slope + 2.0 * mean_slope / mean
+    total = force + normal_force
+    logs = [
+        *(log_g, log_b, jnp.log(force), scale + jnp.log(square[peak]), scale + 0.5 * jnp.log(fourth)),
+        jnp.log(coefficient * total),
+    ]
+    gradients = [
+        *(g_slope, b_slope, force_slope, scale_slope + 2.0 * peak_slope, scale_slope + 2.0 * fourth_slope / fourth),
+        force_slope * force / total,
+    ]
+    return jnp.stack(logs), jnp.stack(gradients)

@@ -2,7 +2,8 @@
 
 Responses to the drive of a record are tabulated in a narrow range of time constants, by exact recursion. The decays of
 an unknown charge, offset, drift and hum are functions of time alone, which all records share. The inner products of
-these functions and the record give a `Compression`.
+these functions and the record give a `Compression`. Functions are computed again where they serve again, which takes
+less time than to store them.
 """
 
 import functools
@@ -12,16 +13,18 @@ from typing import NamedTuple, Self
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from fitact.compiled import jit
+from fitact.batch.gauss_newton import decompose_qr, substitute_back
+from fitact.compiled import jit, map_blocks
 from fitact.likelihood.compression import BASELINE_NAMES, Compression
-from fitact.likelihood.projection import evaluate_baseline, uniform_recurrence
-from fitact.model.response_table import NODES, TABLE_HALF_WIDTH, ResponseTable, chebyshev
+from fitact.likelihood.projection import MAX_DELAY, evaluate_baseline, uniform_recurrence
+from fitact.model.response_table import NODES, TABLE_HALF_WIDTH, ResponseTable, chebyshev, chebyshev_polynomials
 
 HALF_WIDTH = 0.05  # of a record's table, in log tau
 AGES = 1  # time steps by which the delay of a record may differ from that of the first
 TABLE_NODES = 5  # of a record's table, with which its responses are exact to 1e-9
+RECORD_BLOCK = 4  # records whose functions are computed at once; see `map_blocks`
 _BLOCK = 50  # samples whose responses are computed one after the other, in parallel with other blocks
 
 
@@ -29,8 +32,9 @@ class SharedFunctions(NamedTuple):
     """Functions of time that all records share: offset, drift, hum, and the decays of unknown charges.
 
     Attributes:
-        functions: orthonormal over the fitted samples, known at all.
-        used: the fitted samples.
+        functions: orthonormal over the fitted samples, which are all but `margin` at both ends; known at all.
+        is_fitted: 1 at the samples of the drive to which the fitted ones respond, and 0 at others.
+        fitted_functions: the functions at the times of the responses to these, and 0 at others.
         baseline: coordinates of the shapes of `BASELINE_NAMES`.
         decay: Chebyshev coefficients in log tau of the coordinates of e^{-(t - t0) / tau}.
         center: center of the range of log tau, whose half-width is `TABLE_HALF_WIDTH`.
@@ -38,13 +42,15 @@ class SharedFunctions(NamedTuple):
         origin: delay of the first record in time steps, rounded.
     """
 
-    functions: Float[np.ndarray, "samples shared"]
-    used: slice
-    baseline: Float[np.ndarray, "shapes shared"]
-    decay: Float[np.ndarray, "shared terms"]
-    center: float
-    time_step: float
-    origin: int
+    functions: Float[Array, "shared samples"]
+    margin: int
+    is_fitted: Float[Array, " samples"]
+    fitted_functions: Float[Array, "shared samples"]
+    baseline: Float[Array, "shapes shared"]
+    decay: Float[Array, "shared terms"]
+    center: Float[Array, ""]
+    time_step: Float[Array, ""]
+    origin: Int[Array, ""]
 
     @classmethod
     def from_times(cls, time: Float[np.ndarray, " samples"], margin: int, tau: float, origin: int) -> Self:
@@ -52,26 +58,49 @@ class SharedFunctions(NamedTuple):
 
         `margin` samples at both ends are not fitted.
         """
-        used = slice(margin, time.size - margin)
         x, to_series = chebyshev(NODES)
         decays = np.exp(-(time - time[0])[:, None] / (tau * np.exp(TABLE_HALF_WIDTH * x)))
         middle, half = 0.5 * (time[0] + time[-1]), 0.5 * (time[-1] - time[0])
         shapes = np.column_stack([evaluate_baseline(time, middle, half).T, decays])
-        _, sizes, modes = np.linalg.svd(shapes[used], full_matrices=False)
+        _, sizes, modes = np.linalg.svd(shapes[margin : time.size - margin], full_matrices=False)
         # a charge is no larger than the drive, and needs fewer digits
         rank = np.count_nonzero(sizes > 1e-10 * sizes[0])
         baseline, decay = np.split(sizes[:rank, None] * modes[:rank], [len(BASELINE_NAMES)], axis=1)
-        functions, step = shapes @ (modes[:rank].T / sizes[:rank]), float((time[-1] - time[0]) / (time.size - 1))
-        return cls(functions, used, baseline.T, decay @ to_series.T, math.log(tau), step, origin)
+        functions, step = modes[:rank] / sizes[:rank, None] @ shapes.T, (time[-1] - time[0]) / (time.size - 1)
+        is_fitted = np.zeros(time.size)
+        is_fitted[margin - origin : time.size - margin - origin] = 1.0
+        fitted_functions = is_fitted * np.roll(functions, -origin, axis=1)
+        numbers = np.asarray(math.log(tau)), np.asarray(step), np.asarray(origin)
+        return cls(functions, margin, is_fitted, fitted_functions, baseline.T, decay @ to_series.T, *numbers)
 
     @property
     def size(self) -> int:
         """Number of functions."""
-        return self.functions.shape[1]
+        return len(self.functions)
 
-    def select_fitted(self, own: Float[np.ndarray, "records own samples"]) -> Float[np.ndarray, "records own used"]:
-        """Return functions at the times of the drive at the fitted samples, delayed by `origin`."""
-        return own[:, :, self.used.start - self.origin : self.used.stop - self.origin]
+    def select_fitted(self, values: Float[Array, " samples"]) -> Float[Array, " used"]:
+        """Return values at the times of the drive at the fitted samples, delayed by `origin`."""
+        return lax.dynamic_slice(values, (self.margin - self.origin,), (values.size - 2 * self.margin,))
+
+    def filter_drive(
+        self, V: Float[Array, " samples"], Vsc: Float[Array, " samples"], tau: Float[Array, " nodes"]
+    ) -> Float[Array, "own samples"]:
+        """Return the functions of a record: the responses to V at the nodes, the steps of V, and last Vsc itself.
+
+        They are those at the times of the drive, i.e. without the delay `origin`.
+        """
+        x, samples = self.time_step / tau, V.size
+        rises = jnp.diff(jnp.pad(V, (AGES + 1, AGES), mode="edge"))
+        steps = [rises[AGES - age : AGES - age + samples] for age in range(-AGES, AGES)]
+        # the first sample is a jump from 0
+        rise = jnp.pad(steps[AGES], (0, -samples % _BLOCK))
+        u = uniform_recurrence(rise, V[0] * jnp.exp(x), x, _BLOCK)[:, :samples]
+        return jnp.concatenate([u, jnp.stack([*steps, jnp.roll(Vsc, -self.origin)])])
+
+
+def table_nodes(tau: Float[Array, ""]) -> Float[Array, " nodes"]:
+    """Return the time constants of a table around `tau`."""
+    return tau * np.exp(HALF_WIDTH * chebyshev(TABLE_NODES)[0])
 
 
 class Tables(NamedTuple):
@@ -81,43 +110,33 @@ class Tables(NamedTuple):
     drive.
 
     Attributes:
-        own: responses, steps, and last the record itself, at the times of the drive, i.e. without the delay `origin`.
-        center: center of each table, in log tau.
+        g, b: estimates of the parameters, around which each table lies (b in s).
+        is_possible: whether they could be estimated.
         decay: decays of an unknown charge at the nodes, in the shared functions.
         coordinates: orthogonal coordinates of the functions, with the inner products over the fitted samples.
         observed: the same for the record.
     """
 
     shared: SharedFunctions
-    own: Float[np.ndarray, "records own samples"]
-    center: Float[np.ndarray, " records"]
+    g: Float[np.ndarray, " records"]
+    b: Float[np.ndarray, " records"]
+    is_possible: Bool[np.ndarray, " records"]
     decay: Float[np.ndarray, "records shared nodes"]
     coordinates: Float[np.ndarray, "records rows functions"]
     observed: Float[np.ndarray, "records rows"]
 
     @classmethod
     def from_records(
-        cls,
-        shared: SharedFunctions,
-        V: Float[np.ndarray, "records samples"],
-        Vsc: Float[np.ndarray, "records samples"],
-        tau: Float[np.ndarray, " records"],
+        cls, shared: SharedFunctions, V: Float[np.ndarray, "records samples"], Vsc: Float[np.ndarray, "records samples"]
     ) -> Self:
-        """Tabulate the responses to V around the time constants `tau` (s)."""
-        nodes, size = tau[:, None] * np.exp(HALF_WIDTH * chebyshev(TABLE_NODES)[0]), shared.size
-        inside = (np.log(nodes) - shared.center) / TABLE_HALF_WIDTH
-        decay = np.swapaxes(np.polynomial.chebyshev.chebvander(inside, NODES - 1) @ shared.decay.T, 1, 2)
-        own = _filter_drives(V, np.roll(Vsc, -shared.origin, axis=1), shared.time_step / nodes)
-        used = shared.select_fitted(own)
-        across = used.reshape(-1, used.shape[-1]) @ shared.functions[shared.used]
-        across = np.swapaxes(across.reshape(*own.shape[:2], size), 1, 2)
-        products = used @ np.swapaxes(used, 1, 2)
+        """Tabulate the responses of each record."""
+        g, b, is_possible, decay, across, products = _multiply_functions(shared, V, Vsc)
         scale = np.sqrt(np.einsum("rii->ri", products))
         rest = _factor_products(products - np.swapaxes(across, 1, 2) @ across, scale)
         columns = np.concatenate([across, rest], axis=1)
-        first = np.broadcast_to(np.eye(columns.shape[1], size), (len(V), columns.shape[1], size))
+        first = np.broadcast_to(np.eye(columns.shape[1], shared.size), (len(V), columns.shape[1], shared.size))
         coordinates = np.concatenate([first, columns[:, :, :-1]], axis=2)
-        return cls(shared, own, np.log(tau), decay, coordinates, columns[:, :, -1])
+        return cls(shared, g, b, is_possible, decay, coordinates, columns[:, :, -1])
 
     def fields(self, *, in_functions: bool = False) -> dict[str, np.ndarray]:
         """Return the fields of `Compression` that differ between records, by name.
@@ -132,7 +151,7 @@ class Tables(NamedTuple):
         zeros, missing = np.zeros((records, rows)), ((0, 0), (0, rows - size))
         steps = np.swapaxes(to_rows[:, :, size + TABLE_NODES :], 1, 2) / self.shared.time_step
         return {
-            "center": self.center,
+            "center": np.log(self.b),
             "signal": to_rows[:, :, size : size + TABLE_NODES] @ series,
             "decay": np.pad(self.decay @ series, (*missing, (0, 0))),
             "baseline": np.tile(np.pad(self.shared.baseline, missing), (records, 1, 1)),
@@ -142,13 +161,6 @@ class Tables(NamedTuple):
             "observed_slope": zeros,
             "steps": steps,
         }
-
-    def residuals(self, fitted: Float[np.ndarray, "records functions"]) -> Float[np.ndarray, "records used"]:
-        """Return the records minus a model with these coefficients, at the fitted samples."""
-        size, used = self.shared.size, self.shared.select_fitted(self.own)
-        model = (fitted[:, None, size:] @ used[:, :-1])[:, 0]
-        model += fitted[:, :size] @ self.shared.functions[self.shared.used].T
-        return np.subtract(used[:, -1], model, out=model)
 
 
 def to_response_table(table: Compression) -> ResponseTable:
@@ -166,22 +178,46 @@ def _factor_products(
     return np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2) * scale[:, None, :]
 
 
-def _filter_drives(
-    V: Float[np.ndarray, "records samples"], Vsc: np.ndarray, x: Float[np.ndarray, "records nodes"]
-) -> Float[np.ndarray, "records functions samples"]:
-    """Return the responses at the nodes, the steps of the drive, and Vsc; `x` is the time step over tau."""
-    missing = ((0, 0), (0, -V.shape[1] % _BLOCK))
-    return _filter_padded(np.pad(V, missing, mode="edge"), np.pad(Vsc, missing), x)[:, :, : V.shape[1]]
-
-
 @functools.partial(jit, fast=True)
-def _filter_padded(V: Array, Vsc: Array, x: Array) -> Float[Array, "records functions padded"]:
-    def filter_drive(record: tuple[Array, Array, Array]) -> Array:
-        v, vsc, x = record
-        rises = jnp.diff(jnp.pad(v, (AGES + 1, AGES), mode="edge"))
-        steps = [rises[AGES - age : AGES - age + v.size] for age in range(-AGES, AGES)]
-        # the first sample is a jump from 0
-        u = uniform_recurrence(steps[AGES], v[0] * jnp.exp(x), x, _BLOCK)
-        return jnp.concatenate([u, jnp.stack(steps), vsc[None]])
+def _multiply_functions(
+    shared: SharedFunctions, V: Float[Array, "records samples"], Vsc: Float[Array, "records samples"]
+) -> tuple[Array, ...]:
+    """Return estimates and decays as in `Tables`, and the inner products of functions with the shared ones and own."""
 
-    return lax.map(filter_drive, (V, Vsc, x))
+    def multiply_record(record: tuple[Array, Array]) -> tuple[Array, ...]:
+        g, b, is_possible = _estimate_start(shared, *record)
+        nodes = table_nodes(b)
+        inside = (jnp.log(nodes) - shared.center) / TABLE_HALF_WIDTH
+        decay = shared.decay @ chebyshev_polynomials(inside, NODES)
+        used = shared.is_fitted * shared.filter_drive(*record, nodes)
+        return g, b, is_possible, decay, shared.fitted_functions @ used.T, used @ used.T
+
+    return map_blocks(multiply_record, (V, Vsc), RECORD_BLOCK)
+
+
+def _estimate_start(
+    shared: SharedFunctions, V: Float[Array, " samples"], Vsc: Float[Array, " samples"], stride: int = 3
+) -> tuple[Float[Array, ""], Float[Array, ""], Bool[Array, ""]]:
+    """Estimate g and b (s) from Vsc = g V - (1/b) ∫ Vsc dt + line, with V delayed, and whether it is possible.
+
+    One sample of `stride` suffices; even strides would meet the same phases of most drives again.
+    """
+    summed = jnp.pad(Vsc, (0, -Vsc.size % _BLOCK))
+    integral = uniform_recurrence(summed, jnp.zeros(1), jnp.zeros(1), _BLOCK)[0, : Vsc.size] - 0.5 * Vsc
+    delayed = jnp.roll(V, shared.origin)
+    # steps of the drive around a sample represent a delay by a fraction of a step
+    before, moved, after = (delayed[MAX_DELAY + k : V.size - MAX_DELAY + k : stride] for k in (-1, 0, 1))
+    integral, observed = (x[MAX_DELAY : V.size - MAX_DELAY : stride] for x in (integral, Vsc))
+    line = jnp.linspace(-1.0, 1.0, moved.size)
+    rows = jnp.stack([moved, integral, moved - before, after - moved, jnp.ones_like(line), line, observed])
+    products = rows @ rows.T
+    scale = jnp.sqrt(jnp.diagonal(products))
+    scale = jnp.where(scale == 0.0, 1.0, scale)
+    products = products / (scale[:, None] * scale)
+    normal = products[:-1, :-1] + np.finfo(float).eps * np.eye(len(rows) - 1)
+    solution = substitute_back(*decompose_qr(normal, products[:-1, -1]))[:2] * scale[-1] / scale[:2]
+    g, rate = solution[0], -solution[1] / shared.time_step
+    log_b = -jnp.log(jnp.maximum(rate, np.finfo(float).tiny))
+    is_possible = (g > 0.0) & (g < 0.5) & (log_b > jnp.log(3.0 * shared.time_step))
+    is_possible &= jnp.abs(log_b - shared.center) < TABLE_HALF_WIDTH - HALF_WIDTH
+    return jnp.where(is_possible, g, 0.1), jnp.exp(jnp.where(is_possible, log_b, shared.center)), is_possible

@@ -7,19 +7,20 @@ from collections.abc import Sequence
 from typing import Self
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fitact.batch.batch_problem import BatchFit, BatchProblem, Screening, split_rows, stack_channel
 from fitact.batch.gauss_newton import GaussNewtonResult, RecordInputs, find_optima
-from fitact.batch.shared_basis import SharedBasis
-from fitact.compiled import jit
+from fitact.batch.shared_basis import SAMPLE_BLOCK, SharedBasis
+from fitact.compiled import jit, map_blocks
 from fitact.data.record import Record
 from fitact.fitting import derived
 from fitact.fitting.derived import DerivedQuantities, log_derivatives
 from fitact.fitting.least_squares import MIN_BIC_DECREASE
 from fitact.fitting.residual_statistics import is_misfit, residual_statistics
-from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics
+from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics, sum_rows
 from fitact.likelihood.channel import LINEAR_NUISANCES
 from fitact.model.chirp import Chirp
 from fitact.model.circuit import passes_direct_current
@@ -85,14 +86,16 @@ class StatedDriveProblem(BatchProblem):
 
     def fit(self, records: Sequence[Record], whiteness: bool = True) -> BatchFit:
         """Fit `unit` records, and optionally test the residuals for structure (`whiteness`), in double precision."""
-        parts = split_rows(stack_channel(records, "Vsc"), _CHUNK)
-        screened = [(*Screening.from_values(part, self.settings), self.basis.project(part)) for part in parts]
-        noise, height, fine, railed, coordinates = map(np.concatenate, zip(*screened, strict=True))
+        observed = stack_channel(records, "Vsc")
+        screened = [Screening.from_values(part, self.settings) for part in split_rows(observed, _CHUNK)]
+        noise, height, fine, railed = map(np.concatenate, zip(*screened, strict=True))
+        coordinates = self.basis.project(observed)
         optima, accepted = self.find_optima(coordinates, noise, MIN_RELATIVE_NOISE * height)
         logs, gradients = _log_derived(self.derive, optima.theta, optima.sigma)
         square, tests = optima.sum_of_squares, None
         if whiteness:
-            from_samples, tests = self._residual_statistics(parts, optima.fitted[:, : len(self.basis.signal)])
+            fitted, functions = optima.fitted[:, : len(self.basis.signal)], self.basis.functions
+            from_samples, tests = _residual_statistics(functions, self.phases, fitted, observed)
             loss = np.abs(square - from_samples)
         else:
             # relative to the square of the record; 12 eps was observed
@@ -107,20 +110,6 @@ class StatedDriveProblem(BatchProblem):
         prior = np.broadcast_to(self.prior_factor, factor.shape)
         theta, sigma = optima.theta, optima.sigma
         return BatchFit(accepted, coordinates, theta, sigma, factor, prior, logs, gradients, figures, freed)
-
-    def _residual_statistics(
-        self, parts: Sequence[np.ndarray], signal: Float[np.ndarray, "records rank"]
-    ) -> tuple[Float[np.ndarray, " records"], ResidualTestStatistics]:
-        """Return the residual sums of squares over the samples, and statistics of the residual tests."""
-        statistics, single = [], np.float32  # which suffices for the tests, and to notice a loss of digits in `fit`
-        functions = self.basis.functions[:, : signal.shape[1]].astype(single).T
-        for part, coefficients in zip(parts, split_rows(signal.astype(single), _CHUNK), strict=True):
-            residuals = coefficients @ functions
-            np.subtract(part.astype(single), residuals, out=residuals)
-            tests = ResidualTestStatistics.from_residuals(residuals, self.phases)
-            statistics.append((np.vecdot(residuals, residuals), *tests))
-        square, *others = map(np.concatenate, zip(*statistics, strict=True))
-        return square, ResidualTestStatistics(*others)
 
     def find_optima(
         self,
@@ -149,6 +138,24 @@ class StatedDriveProblem(BatchProblem):
         x = np.linspace(-1.0, 1.0, 257)
         signal = self.basis.signal @ np.polynomial.chebyshev.chebvander(x, NODES - 1).T
         return np.exp(self.basis.center + TABLE_HALF_WIDTH * x), signal, np.einsum("ij,ij->j", signal, signal)
+
+
+@functools.partial(jit, fast=True)
+def _residual_statistics(
+    functions: Array, phases: PhaseBins | None, fitted: Float[Array, "records rank"], observed: Array
+) -> tuple[Float[Array, " records"], ResidualTestStatistics]:
+    """Return the residual sums of squares over the samples, and statistics of the residual tests.
+
+    Single precision suffices for the tests, and to notice a loss of digits in the coordinates.
+    """
+    signal = functions[:, : fitted.shape[1]].astype(jnp.float32).T
+
+    def test_record(record: tuple[Array, Array]) -> tuple[Array, ResidualTestStatistics]:
+        coefficients, values = record
+        residuals = values.astype(jnp.float32) - coefficients.astype(jnp.float32) @ signal
+        return sum_rows(residuals * residuals), ResidualTestStatistics.from_residuals(residuals, phases)
+
+    return map_blocks(test_record, (fitted, observed), SAMPLE_BLOCK)
 
 
 @functools.partial(jit, fast=True)

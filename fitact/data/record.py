@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact import charts
+from fitact.compiled import empty_aligned
 from fitact.data.clipping import clipping_mask
 from fitact.errors import InputError
 from fitact.tables import Display, to_dataframe
@@ -323,11 +324,8 @@ def _peak_position(curve: Float[np.ndarray, " n"], top: int) -> float:
 
 
 def _aligned_copy(values: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-    """Return a copy in double precision, aligned to 64 bytes so that JAX can use it without another copy."""
     values = np.asarray(values, dtype=float)
-    memory = np.empty(values.size + 8)
-    first = -memory.ctypes.data % 64 // 8
-    copy = memory[first : first + values.size].reshape(values.shape)
+    copy = empty_aligned(values.shape)
     copy[...] = values
     return copy
 

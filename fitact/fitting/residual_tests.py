@@ -1,11 +1,17 @@
-"""Tests of residuals for white noise: runs of signs, repetition with the drive, colour, and spectral lines."""
+"""Tests of residuals for white noise: runs of signs, repetition with the drive, colour, and spectral lines.
+
+The statistics are computed with NumPy, or within a program of JAX for many records.
+"""
 
 import math
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Float, Int
+
+from fitact.compiled import array_module
 
 _PHASES = (8, 32, 128, 512)  # numbers of parts of a period; few reveal slow structure, many brief structure
 _MIN_SAMPLES = 64  # least number of samples for the spectral tests
@@ -23,7 +29,7 @@ class Fold(NamedTuple):
 class PhaseBins(NamedTuple):
     """Samples binned by phase of the drive."""
 
-    bin_matrix: scipy.sparse.csr_array  # indicator matrix of the samples in each of the finest parts
+    part: Int[np.ndarray, " samples"]  # number of the finest part of the period in which each sample is
     folds: tuple[Fold, ...]  # partitions, from the finest to the coarsest
 
     @classmethod
@@ -32,78 +38,87 @@ class PhaseBins(NamedTuple):
         if frequency is None or time.size < _MIN_SAMPLES:
             return None
         part = np.minimum((np.mod(time * frequency, 1.0) * _PHASES[-1]).astype(int), _PHASES[-1] - 1)
-        ones = np.ones(time.size, np.float32)
-        bin_matrix = scipy.sparse.csr_array((ones, (part, np.arange(time.size))), (_PHASES[-1], time.size))
         finest = np.bincount(part, minlength=_PHASES[-1])
         counts = [finest.reshape(parts, -1).sum(axis=1) for parts in _PHASES[::-1]]
         sized = [(n, int(np.count_nonzero(n))) for n in counts]
         folds = [Fold(np.where(n > 0, 1.0 / np.maximum(n, 1), 0.0), size, time.size - size) for n, size in sized]
         # with too few samples in each part, the scatter is poorly known
-        return cls(bin_matrix, tuple(fold for fold in folds if fold.scatter_dof >= time.size // 2))
+        return cls(part, tuple(fold for fold in folds if fold.scatter_dof >= time.size // 2))
 
 
 class ResidualTestStatistics(NamedTuple):
     """Test statistics of each record."""
 
-    n_positive: Int[np.ndarray, "*records"]  # number of positive residuals
-    n_runs: Int[np.ndarray, "*records"]  # number of runs of equal sign
-    fold_fractions: Float[np.ndarray, "*records folds"]  # fraction of the sum of squares in the means over parts
-    distance: Float[np.ndarray, "*records"]  # of the cumulative periodogram from a straight line, times sqrt(lines)
-    line_fraction: Float[np.ndarray, "*records"]  # fraction of the power in the strongest line
+    n_positive: Int[Array, "*records"]  # number of positive residuals
+    n_runs: Int[Array, "*records"]  # number of runs of equal sign
+    fold_fractions: Float[Array, "*records folds"]  # fraction of the sum of squares in the means over parts
+    distance: Float[Array, "*records"]  # of the cumulative periodogram from a straight line, times sqrt(lines)
+    line_fraction: Float[Array, "*records"]  # fraction of the power in the strongest line
 
     @classmethod
     def from_residuals(
-        cls, residuals: Float[np.ndarray, "*records n"], phase_bins: PhaseBins | None
+        cls, residuals: Float[Array, "*records n"], phase_bins: PhaseBins | None
     ) -> "ResidualTestStatistics":
         """Compute the statistics, in the precision of the residuals."""
+        xp = array_module(residuals)
         positive = residuals > 0.0
-        turns = count_true(positive[..., 1:] != positive[..., :-1])
-        distance, strongest = _periodogram_statistics(residuals)
+        runs = 1 + xp.count_nonzero(positive[..., 1:] != positive[..., :-1], axis=-1)
         folded = _fold_fractions(residuals, phase_bins)
-        return cls(count_true(positive), 1 + turns, folded, distance, strongest)
+        return cls(xp.count_nonzero(positive, axis=-1), runs, folded, *_periodogram_statistics(residuals))
 
 
-def count_true(mask: Bool[np.ndarray, "*rows n"]) -> Int[np.ndarray, "*rows"]:
-    """Return the number of true values in each row, summed in the smallest integer type, which is fastest."""
-    return mask.view(np.uint8).sum(axis=-1, dtype=np.min_scalar_type(mask.shape[-1])).astype(int)
+def sum_rows(values: Float[Array, "*rows n"]) -> Float[Array, "*rows"]:
+    """Return the sums of rows; XLA vectorises this product with ones, but not a sum."""
+    return values @ np.ones(values.shape[-1], values.dtype)
 
 
 def _fold_fractions(
-    residuals: Float[np.ndarray, "*records n"], phase_bins: PhaseBins | None
-) -> Float[np.ndarray, "*records folds"]:
-    records = residuals.shape[:-1]
+    residuals: Float[Array, "*records n"], phase_bins: PhaseBins | None
+) -> Float[Array, "*records folds"]:
+    xp, records = array_module(residuals), residuals.shape[:-1]
     if phase_bins is None or not phase_bins.folds:
-        return np.empty((*records, 0))
-    square = np.vecdot(residuals, residuals)
-    sums, fractions = phase_bins.bin_matrix @ residuals.reshape(-1, residuals.shape[-1]).T, []
+        return xp.empty((*records, 0))
+    square, fractions = sum_rows(residuals * residuals), []
+    sums = _sum_parts(residuals, phase_bins.part, _PHASES[-1])
     for weight, _, _ in phase_bins.folds:
-        sums = sums.reshape(weight.size, len(sums) // weight.size, -1).sum(axis=1)
-        fractions.append((weight @ sums**2).reshape(records) / np.where(square > 0.0, square, 1.0))
-    return np.stack(fractions, axis=-1)
+        sums = sums.reshape(*records, weight.size, -1).sum(axis=-1)
+        fractions.append((sums * sums) @ weight.astype(sums.dtype) / xp.where(square > 0.0, square, 1.0))
+    return xp.stack(fractions, axis=-1)
+
+
+def _sum_parts(
+    values: Float[Array, "*records n"], part: Int[np.ndarray, " n"], count: int
+) -> Float[Array, "*records count"]:
+    """Return the sum of the values in each of `count` parts."""
+    if array_module(values) is jnp:
+        return jnp.zeros((*values.shape[:-1], count), values.dtype).at[..., part].add(values)
+    rows = values.reshape(-1, values.shape[-1])
+    sums = [np.bincount(part, row, count) for row in rows]
+    return np.array(sums).reshape(*values.shape[:-1], count)
 
 
 def _periodogram_statistics(
-    residuals: Float[np.ndarray, "*records n"], n_bands: int = 250
-) -> tuple[np.ndarray, np.ndarray]:
+    residuals: Float[Array, "*records n"], n_bands: int = 250
+) -> tuple[Float[Array, "*records"], Float[Array, "*records"]]:
     """Return the distance of the cumulative periodogram and the fraction of the strongest line; 0 without any power.
 
     The cumulative periodogram is evaluated at about `n_bands` frequencies, which suffices for coloured noise.
     """
-    spectrum = scipy.fft.rfft(residuals)[..., 1 : (residuals.shape[-1] + 1) // 2]
-    power = np.square(spectrum.real)
-    power += np.square(spectrum.imag)
-    total, lines = power.sum(axis=-1), power.shape[-1]
+    xp = array_module(residuals)
+    transform = jnp.fft.rfft if xp is jnp else scipy.fft.rfft  # NumPy's would be in double precision
+    spectrum = transform(residuals)[..., 1 : (residuals.shape[-1] + 1) // 2]
+    power = xp.square(spectrum.real) + xp.square(spectrum.imag)
+    total, lines = sum_rows(power), power.shape[-1]
     if lines == 0:
         return total, total
-    inverse_total = np.where(total > 0.0, 1.0 / np.where(total > 0.0, total, 1.0), 0.0)
+    inverse_total = xp.where(total > 0.0, 1.0 / xp.where(total > 0.0, total, 1.0), 0.0)
     width = max(lines // n_bands, 1)
     count = lines // width
-    bands = power[..., : count * width].reshape(*total.shape, count, width)
-    deviation = np.cumsum(bands @ np.ones(width, bands.dtype), axis=-1, dtype=float)
-    deviation *= inverse_total[..., None]
-    deviation -= width * np.arange(1, count + 1) / lines
-    distance = np.maximum(deviation.max(axis=-1), -deviation.min(axis=-1)) * math.sqrt(lines)
-    return np.where(total > 0.0, distance, 0.0), power.max(axis=-1) * inverse_total
+    bands = sum_rows(power[..., : count * width].reshape(*total.shape, count, width))
+    expected = width * np.arange(1, count + 1) / lines
+    deviation = xp.cumsum(bands.astype(float), axis=-1) * inverse_total[..., None] - expected
+    distance = xp.max(xp.abs(deviation), axis=-1) * math.sqrt(lines)
+    return xp.where(total > 0.0, distance, 0.0), xp.max(power, axis=-1) * inverse_total
 
 
 def p_values(
