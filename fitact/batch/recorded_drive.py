@@ -38,6 +38,7 @@ from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.projection import MAX_DELAY, is_exactly_uniform
 from fitact.model.circuit import passes_direct_current
 from fitact.model.force import force_constant
+from fitact.model.response_table import ResponseTable, chebyshev
 from fitact.model.skin import WithSkin
 from fitact.problem.build import MIN_RELATIVE_NOISE, Problem, edge_gain_sd
 from fitact.problem.drive_choice import has_unresolved_edge, has_unresolved_edges
@@ -68,7 +69,7 @@ class RecordedDriveProblem(BatchProblem):
             the drive does not repeat.
     """
 
-    unit, settings = 128, GaussNewton(block=32)
+    unit, settings = 64, GaussNewton(block=32)
     shared: SharedFunctions
     linear_sd: Float[np.ndarray, " nuisances"]
     gain_sd: float
@@ -159,9 +160,13 @@ class RecordedDriveProblem(BatchProblem):
         if gain_sd is not None:
             place = self.names.index("gain")
             prior[:, place, place] = gain_sd
-        return BatchFit(
-            accepted, tables.observed, optima.theta, optima.sigma, factor, prior, logs, gradients, figures, freed
-        )
+        theta, sigma = optima.theta, optima.sigma
+        return BatchFit(accepted, inputs, theta, sigma, factor, prior, logs, gradients, figures, freed)
+
+    def tabulate_responses(self, records: Sequence[Record], optima: BatchFit) -> ResponseTable:
+        """Return responses at the times of `derive` for each of `unit` records."""
+        drives, shared, size = stack_channel(records, "V"), self.shared, self.derive.time.size
+        return _tabulate_responses(shared, self.evaluated.start, size, optima.inputs.table["center"], drives)
 
     def _figures(
         self,
@@ -342,3 +347,30 @@ def _derive_record(
         force_slope * force / total,
     ]
     return jnp.stack(logs), jnp.stack(gradients)
+
+
+@functools.partial(jit, fast=True)
+def _tabulate_responses(
+    shared: SharedFunctions,
+    begin: int,
+    count: int,
+    center: Float[Array, " records"],
+    V: Float[Array, "records samples"],
+) -> ResponseTable:
+    """Return a table for each record, padded to `count` times."""
+    series = chebyshev(TABLE_NODES)[1].T
+
+    def tabulate_record(record: tuple[Array, Array]) -> ResponseTable:
+        center, v = record
+        nodes = table_nodes(jnp.exp(center))
+        own = shared.filter_drive(v, jnp.zeros_like(v), nodes)[:TABLE_NODES]
+        decays = (shared.decay @ shared.decay_polynomials(nodes)).T @ shared.functions
+        signal, decay = (
+            jnp.pad(series.T @ each[:, begin : begin + count], ((0, 0), (0, max(begin + count - v.size, 0)))).T
+            for each in (own, decays)
+        )
+        half_width, zero = jnp.asarray(HALF_WIDTH), jnp.zeros(())
+        signal = jnp.pad(signal, ((0, 0), (0, 1)))
+        return ResponseTable(center[None], half_width, signal, decay, jnp.eye(TABLE_NODES), zero)
+
+    return map_blocks(tabulate_record, (center, V), RECORD_BLOCK)

@@ -82,6 +82,10 @@ class SharedFunctions(NamedTuple):
         """Return values at the times of the drive at the fitted samples, delayed by `origin`."""
         return lax.dynamic_slice(values, (self.margin - self.origin,), (values.size - 2 * self.margin,))
 
+    def decay_polynomials(self, tau: Float[Array, " nodes"]) -> Float[Array, "terms nodes"]:
+        """Return the polynomials in log tau whose coefficients are in `decay`."""
+        return chebyshev_polynomials((jnp.log(tau) - self.center) / TABLE_HALF_WIDTH, NODES)
+
     def filter_drive(
         self, V: Float[Array, " samples"], Vsc: Float[Array, " samples"], tau: Float[Array, " nodes"]
     ) -> Float[Array, "own samples"]:
@@ -187,8 +191,7 @@ def _multiply_functions(
     def multiply_record(record: tuple[Array, Array]) -> tuple[Array, ...]:
         g, b, is_possible = _estimate_start(shared, *record)
         nodes = table_nodes(b)
-        inside = (jnp.log(nodes) - shared.center) / TABLE_HALF_WIDTH
-        decay = shared.decay @ chebyshev_polynomials(inside, NODES)
+        decay = shared.decay @ shared.decay_polynomials(nodes)
         used = shared.is_fitted * shared.filter_drive(*record, nodes)
         return g, b, is_possible, decay, shared.fitted_functions @ used.T, used @ used.T
 

@@ -1,15 +1,16 @@
-"""Separate posteriors of many records; similar ones are sampled in one run of emcee."""
+"""Separate posteriors of many records; similar ones are sampled at once, by importance sampling."""
 
 import dataclasses
 import functools
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple, Self
 
-import jax
-import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
+from fitact.batch.batch_problem import take_rows
 from fitact.batch.fit_many import (
     Batch,
     Finger,
@@ -23,24 +24,27 @@ from fitact.batch.fit_many import (
     run_in_threads,
     tabulate_records,
 )
-from fitact.batch.metropolis import GaussianApproximations, sample_posteriors
-from fitact.batch.stated_drive import StatedDriveProblem
-from fitact.compiled import BatchEvaluator, pad_rows
+from fitact.batch.gauss_newton import RecordInputs
+from fitact.compiled import jit, map_blocks
 from fitact.fitting import derived
-from fitact.fitting.derived import DerivedQuantities
+from fitact.fitting.derived import DerivedQuantities, derive_draw
 from fitact.fitting.fit import fit
+from fitact.likelihood.channel import LINEAR_NUISANCES
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import scale_information
-from fitact.sampling.convergence import Convergence, diagnose_chain
-from fitact.sampling.ensemble import TRACKED_WALKERS, sample
+from fitact.model.response_table import ResponseTable
+from fitact.sampling.convergence import Convergence, ImportanceWeights, diagnose_weights, pareto_smooth
+from fitact.sampling.ensemble import sample
 from fitact.sampling.posterior import Posterior
-from fitact.sampling.proposal import PROBES, is_normal
+from fitact.sampling.proposal import draw_student_t, student_log_density
 from fitact.scene.scene import Scene
 from fitact.summary import PROBABILITIES
 
-_BLOCK = 32  # records sampled together, padded to this number; 16 MB of draws
+_BLOCK = 32  # records sampled together, padded to this number
+_DRAWS = 8192  # of each posterior
+_DERIVED_DRAWS = 2048  # of these, for which derived quantities are computed, which cost more
 _TRACKED = ("g", "b", "force_mean")
-_CONVERGENCE_COLUMNS = ("converged", "rhat_max", "ess_min", "tau_max", "acceptance", "steps", "walkers", "ensembles")
+_CONVERGENCE_COLUMNS = ("converged", "level", "ess_min", "k_hat", "rhat_max")
 
 
 def sample_many(
@@ -56,13 +60,13 @@ def sample_many(
     """Fit each of many records separately and sample its posterior, like `fitact.sample`.
 
     Rows of `fit_many` are extended by the posterior quantiles of each parameter, each derived quantity and the noise
-    (e.g. `Rsc_q05`, `force_mean_q975`), and by `converged`, `rhat_max`, `ess_min`, `tau_max`, `acceptance`, `steps`
-    and `walkers` of each ensemble. Rows that have not converged are not `trusted`.
+    (e.g. `Rsc_q05`, `force_mean_q975`), and by `converged`, the method `level`, `ess_min`, `k_hat` of "psis" and
+    `rhat_max` of "emcee". Rows that have not converged are not `trusted`.
 
-    Records that are fitted in a batch and have a posterior near its Laplace approximation are sampled together, 32 at
-    once, by Metropolis-Hastings moves that propose from this approximation. The random numbers of each record depend on
-    `seed` and its content only, so that other records hardly affect it. Records that have not converged, and all
-    others, are sampled separately, like `fitact.sample` with this seed.
+    Records that are fitted in a batch are sampled 32 at once, by Pareto-smoothed importance sampling around the fit.
+    The random numbers of each record depend on `seed` and its content only, so that other records hardly affect it.
+    Records whose weights are unreliable, and all others, are sampled separately by emcee, like `fitact.sample` with
+    this seed.
 
     Args:
         records: records, spectra, paths of files, or sequences of them, as in `fit_many`.
@@ -80,27 +84,34 @@ def sample_many(
 
 
 class _Targets(NamedTuple):
-    """Posteriors near their Laplace approximations, of records that share a likelihood except for the tables.
+    """Posteriors of records that share a likelihood except for the tables.
 
     Attributes:
         members, rows: records, and rows of their fits.
-        likelihood: common likelihood; `coordinates` replaces the record in its compression.
+        likelihood: common likelihood, some of whose fields `inputs` replace.
+        tables: responses at the times of `derive`, if each record has its own drive.
+        centers: optima, theta and log sigma.
+        factors: factors of the covariances.
     """
 
     members: list[Member]
     rows: list[Row]
     likelihood: Likelihood
     derive: DerivedQuantities
-    coordinates: Float[np.ndarray, "records coordinates"]
-    approximations: GaussianApproximations
+    inputs: RecordInputs
+    tables: ResponseTable | None
+    centers: Float[np.ndarray, "records n"]
+    factors: Float[np.ndarray, "records n n"]
 
     def subset(self, indices: Sequence[int]) -> Self:
-        chosen = np.array(indices)
+        rows = np.array(indices)
         return self._replace(
             members=[self.members[i] for i in indices],
             rows=[self.rows[i] for i in indices],
-            coordinates=self.coordinates[chosen],
-            approximations=GaussianApproximations(*(field[chosen] for field in self.approximations)),
+            inputs=take_rows(self.inputs, rows),
+            tables=take_rows(self.tables, rows),
+            centers=self.centers[rows],
+            factors=self.factors[rows],
         )
 
 
@@ -128,118 +139,99 @@ def _split_blocks(members: list[Member], targets: _Targets | None) -> Iterator[t
 
 
 def _make_targets(batch: Batch) -> _Targets | None:
-    """Return the accepted records of a batch whose posteriors are nearly normal, or None."""
+    """Return the accepted records of a batch, or None."""
     (problem, members), (rows, optima) = batch, fit_batch(batch)
     places = [place for place, (number, _) in enumerate(members) if number in rows]
-    if not isinstance(problem, StatedDriveProblem) or optima is None or not places:
+    if problem is None or optima is None or not places:
         return None
-    members = [members[place] for place in places]
-    theta, sigma, factor = optima.theta[places], optima.sigma[places], optima.covariance_factor[places]
-    try:
-        approximations = _laplace_approximations(theta, sigma, factor, problem.samples)
-        fit_rows = [rows[number] for number, _ in members]
-        targets = _Targets(
-            members, fit_rows, problem.likelihood, problem.derive, optima.coordinates[places], approximations
-        )
-        targets = targets._replace(approximations=approximations.refine(_probe_axes(targets)))
-        is_near = np.all(is_normal(_probe_axes(targets)), axis=1)
-    except np.linalg.LinAlgError:  # one record may make the joint computation fail
-        return None
-    return targets.subset(np.flatnonzero(is_near).tolist()) if is_near.any() else None
-
-
-def _laplace_approximations(
-    theta: np.ndarray, sigma: np.ndarray, covariance_factor: np.ndarray, samples: int
-) -> GaussianApproximations:
-    """Compute `Fit.point` and `Fit.point_root` of each record."""
-    size = theta.shape[1]
-    roots = np.pad(covariance_factor, ((0, 0), (0, 1), (0, 1)))
-    roots[:, size, size] = (scale_information("white") * (samples - size)) ** -0.5
-    return GaussianApproximations.from_covariance_factors(np.column_stack([theta, np.log(sigma)]), roots)
-
-
-def _probe_axes(targets: _Targets) -> Float[np.ndarray, "records n probes"]:
-    """Evaluate the log-posteriors along the principal axes of their approximations."""
-    size = targets.approximations.centers.shape[1]
-    z = (np.eye(size)[:, None] * PROBES[:, None]).reshape(-1, size)
-    points = targets.approximations.from_standard_normal(np.tile(z, (len(targets.members), 1, 1)))
-    return _LogProbs(targets)(points).reshape(-1, size, PROBES.size)
-
-
-class _LogProbs:
-    """Log-posteriors of points of each record; -inf outside its table, which is recorded.
-
-    `chunk_points` of each record are evaluated at once, so that one size is compiled.
-    """
-
-    def __init__(self, targets: _Targets, chunk_points: int = 64) -> None:
-        self._coordinates, self._chunk_points = targets.coordinates, chunk_points
-        rows = chunk_points * targets.coordinates.shape[1]
-        self._evaluate = BatchEvaluator(_log_probs, targets.likelihood, rows, _BLOCK)
-        self.outside_table = np.zeros(len(targets.members), dtype=bool)
-
-    def __call__(self, points: Float[np.ndarray, "records any n"]) -> Float[np.ndarray, "records any"]:
-        count, size = points.shape[1], self._chunk_points
-        chunks = np.split(pad_rows(points, size, axis=1), -(-count // size), axis=1)
-        values = np.concatenate([self._evaluate(self._coordinates, chunk) for chunk in chunks], axis=1)[:, :count]
-        is_outside = np.isnan(values)
-        self.outside_table |= is_outside.any(axis=1)
-        return np.where(is_outside, -np.inf, values)
-
-
-def _log_probs(likelihood: Likelihood, coordinates: Array, points: Array) -> Float[Array, " points"]:
-    channel = likelihood.channels[0]
-    assert channel.compression is not None
-    compression = dataclasses.replace(channel.compression, observed=coordinates)
-    likelihood = likelihood.replace_channel(0, dataclasses.replace(channel, compression=compression))
-    return jax.vmap(likelihood.log_prob)(points)
+    accepted, size = [members[place] for place in places], optima.theta.shape[1]
+    factors = np.pad(optima.covariance_factor, ((0, 0), (0, 1), (0, 1)))
+    factors[:, size, size] = (scale_information("white") * (problem.samples - size)) ** -0.5
+    centers = np.column_stack([optima.theta, np.log(optima.sigma)])
+    tables = problem.tabulate_responses(problem.pad_records(members), optima)
+    selected = take_rows((optima.inputs, tables, centers, factors), np.array(places))
+    return _Targets(accepted, [rows[number] for number, _ in accepted], problem.likelihood, problem.derive, *selected)
 
 
 def _sample_block(
-    job: tuple[list[Member], _Targets | None], seed: int, steps: int = 200, rhat_draws: int = 1000
+    job: tuple[list[Member], _Targets | None], seed: int, draws: int = _DRAWS, min_effective: float = 2000.0
 ) -> dict[int, Row]:
-    """Sample a block, and return the rows of converged records.
-
-    `steps` is the length of each ensemble (nearly normal posteriors need some 120); `rhat_draws` as in
-    `diagnose_chain`.
-    """
+    """Sample a block, and return the rows of records whose weights are reliable and not too uneven."""
     members, targets = job
     if targets is None:
         return {}
     full = targets.subset([*range(len(members)), *[len(members) - 1] * (_BLOCK - len(members))])
-    log_probs = _LogProbs(full)
-    seeds = [[seed, int(record.fingerprint, 16)] for _, record in full.members]
-    sampled = sample_posteriors(log_probs, full.approximations, steps, seeds)
-    # derived quantities cost more than the draws, so only some draws are used
-    points = sampled.points[:, :, :, :TRACKED_WALKERS]
-    evaluator = BatchEvaluator(_derive, full.derive, full.derive.time.size, batch=1024)
-    derived_draws = evaluator.map_over(points.shape[:-1], points)
-    names = (*full.likelihood.names, "sigma")
-    rows = {}
+    generators = [np.random.default_rng([seed, int(record.fingerprint, 16)]) for _, record in full.members]
+    z = np.stack([draw_student_t(each, draws, full.centers.shape[1]) for each in generators])
+    points = full.centers[:, None] + z @ np.swapaxes(full.factors, 1, 2)
+    log_ratios = evaluate_log_probs(full.likelihood, full.inputs, points) - student_log_density(z)
+    deviates = np.stack([each.standard_normal((_DERIVED_DRAWS, 1, len(LINEAR_NUISANCES))) for each in generators])
+    some = points[:, :_DERIVED_DRAWS]
+    quantities = _derive_draws(full.derive, full.likelihood, full.inputs, full.tables, some, deviates)
+    names, rows = (*full.likelihood.names, "sigma"), {}
     for i, ((number, _), row) in enumerate(zip(members, targets.rows, strict=True)):
-        quantities = dict(zip(derived.DERIVED_NAMES, np.moveaxis(derived_draws[i], -1, 0), strict=True))
-        tracked = {name: quantities[name] for name in _TRACKED}
-        convergence = diagnose_chain(names, sampled.points[i], sampled.accepted[i], tracked, rhat_draws)
-        if convergence.converged and not log_probs.outside_table[i]:
-            draws = dict(zip(names, np.moveaxis(np.exp(sampled.points[i]), -1, 0), strict=True)) | quantities
-            draws = {name: values[:, convergence.burn :] for name, values in draws.items()}
-            rows[number] = row | _posterior_columns(row, draws, convergence)
+        if np.isnan(log_ratios[i]).any():  # outside the table
+            continue
+        weights = pareto_smooth(log_ratios[i])
+        drawn = dict(zip(names, points[i].T, strict=True)) | dict(
+            zip(derived.DERIVED_NAMES, quantities[i].T, strict=True)
+        )
+        tracked = {name: drawn[name] for name in (*names, *_TRACKED)}
+        convergence = diagnose_weights("psis", weights, tracked, n_resampled=math.inf)
+        if convergence.converged and convergence.ess_min >= min_effective:
+            natural = {name: np.exp(values) if name in names else values for name, values in drawn.items()}
+            rows[number] = row | _posterior_columns(row, natural, convergence, weights)
     return rows
 
 
-def _derive(derive: DerivedQuantities, point: Array) -> Float[Array, " derived"]:
-    theta, log_sigma = derive.likelihood.split(point)
-    return derive(theta, jnp.exp(log_sigma))
+@functools.partial(jit, fast=True)
+def evaluate_log_probs(
+    likelihood: Likelihood, inputs: RecordInputs, points: Float[Array, "records draws n"]
+) -> Float[Array, "records draws"]:
+    """Return the log-posteriors of the points of each record; NaN outside its table."""
+
+    def evaluate_record(record: tuple[RecordInputs, Array]) -> Array:
+        inputs, points = record
+        return lax.map(inputs.model(likelihood).log_prob, points, batch_size=256)
+
+    return map_blocks(evaluate_record, (inputs, points), 1)
 
 
-def _posterior_columns(row: Row, draws: Mapping[str, np.ndarray], convergence: Convergence) -> Row:
-    """Return the posterior quantiles of the quantities in a row, and convergence diagnostics."""
+@functools.partial(jit, fast=True)
+def _derive_draws(
+    derive: DerivedQuantities,
+    likelihood: Likelihood,
+    inputs: RecordInputs,
+    tables: ResponseTable | None,
+    points: Float[Array, "records draws n"],
+    deviates: Float[Array, "records draws channels nuisances"],
+) -> Float[Array, "records draws derived"]:
+    def derive_record(record: tuple[RecordInputs, ResponseTable | None, Array, Array]) -> Array:
+        inputs, table, points, deviates = record
+        quantities = dataclasses.replace(derive, likelihood=inputs.model(likelihood), drive=table or derive.drive)
+        return lax.map(lambda draw: derive_draw(quantities, *draw), (points, deviates), batch_size=8)
+
+    return map_blocks(derive_record, (inputs, tables, points, deviates), 1)
+
+
+def _posterior_columns(
+    row: Row, draws: Mapping[str, np.ndarray], convergence: Convergence, weights: ImportanceWeights | None = None
+) -> Row:
+    """Return the posterior quantiles of the quantities in a row, and convergence diagnostics.
+
+    `weights` are those of the first draws.
+    """
     columns: Row = {}
     for key in row:
         name = "sigma" if key == "noise" else key
         if name in draws:
-            values = np.quantile(draws[name], list(PROBABILITIES.values()))
-            columns |= {f"{key}_{q}": float(value) for q, value in zip(PROBABILITIES, values, strict=True)}
+            values, probabilities = draws[name], list(PROBABILITIES.values())
+            if weights is None:
+                quantiles = np.quantile(values, probabilities)
+            else:
+                weight = weights.weights[: len(values)]
+                quantiles = np.quantile(values, probabilities, weights=weight, method="inverted_cdf")
+            columns |= {f"{key}_{q}": float(value) for q, value in zip(PROBABILITIES, quantiles, strict=True)}
     return columns | {name: getattr(convergence, name) for name in _CONVERGENCE_COLUMNS}
 
 

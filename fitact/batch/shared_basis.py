@@ -4,7 +4,6 @@ The coordinates serve like those of a `fitact.likelihood.compression.Compression
 only once, so that a record costs one product with a matrix of some twenty columns.
 """
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -12,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitact.compiled import jit, map_blocks, pad_samples
-from fitact.fitting.residual_tests import sum_rows
+from fitact.compiled import jit, pad_samples
 from fitact.likelihood.compression import Compression
 from fitact.likelihood.projection import RANK_TOLERANCE, baseline_functions
 from fitact.model.drive import Drive
@@ -82,16 +80,9 @@ class SharedBasis(NamedTuple):
 
     def project(self, observed: Float[np.ndarray, "records samples"]) -> Float[np.ndarray, "records coordinates+1"]:
         """Return coordinates of records; the last is the length of the component outside the basis."""
-        return _project(self.functions, observed)
-
-
-@functools.partial(jit, fast=True)
-def _project(functions: Array, observed: Array) -> Array:
-    def project_record(values: Array) -> Array:
-        inside = values @ functions
-        return jnp.append(inside, jnp.sqrt(jnp.maximum(sum_rows(values * values) - inside @ inside, 0.0)))
-
-    return map_blocks(project_record, observed, SAMPLE_BLOCK)
+        inside = observed @ self.functions
+        square = np.vecdot(observed, observed) - np.vecdot(inside, inside)
+        return np.column_stack([inside, np.sqrt(np.maximum(square, 0.0))])
 
 
 @jit

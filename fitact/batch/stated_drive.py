@@ -90,7 +90,8 @@ class StatedDriveProblem(BatchProblem):
         screened = [Screening.from_values(part, self.settings) for part in split_rows(observed, _CHUNK)]
         noise, height, fine, railed = map(np.concatenate, zip(*screened, strict=True))
         coordinates = self.basis.project(observed)
-        optima, accepted = self.find_optima(coordinates, noise, MIN_RELATIVE_NOISE * height)
+        inputs = self.make_inputs(coordinates, MIN_RELATIVE_NOISE * height)
+        optima, accepted = self.find_optima(inputs, noise)
         logs, gradients = _log_derived(self.derive, optima.theta, optima.sigma)
         square, tests = optima.sum_of_squares, None
         if whiteness:
@@ -109,28 +110,31 @@ class StatedDriveProblem(BatchProblem):
         factor, freed = np.linalg.inv(optima.r_factor), np.full(len(noise), "")
         prior = np.broadcast_to(self.prior_factor, factor.shape)
         theta, sigma = optima.theta, optima.sigma
-        return BatchFit(accepted, coordinates, theta, sigma, factor, prior, logs, gradients, figures, freed)
+        return BatchFit(accepted, inputs, theta, sigma, factor, prior, logs, gradients, figures, freed)
+
+    @staticmethod
+    def make_inputs(
+        coordinates: Float[np.ndarray, "records coordinates+1"], noise_floor: Float[np.ndarray, " records"]
+    ) -> RecordInputs:
+        """Return the inputs of the least squares for coordinates in `basis`; `noise_floor` in V."""
+        return RecordInputs({"observed": coordinates}, np.zeros((len(coordinates), len(LINEAR_NUISANCES))), noise_floor)
 
     def find_optima(
         self,
-        coordinates: Float[np.ndarray, "records coordinates+1"],
+        inputs: RecordInputs,
         noise: Float[np.ndarray, " records"],
-        noise_floor: Float[np.ndarray, " records"],
     ) -> tuple[GaussNewtonResult, Bool[np.ndarray, " records"]]:
-        """Solve the least squares for `coordinates` in `basis`, and return which records the table covers.
-
-        Sigma starts at `noise` and has the lower bound `noise_floor`, V.
-        """
+        """Solve the least squares, and return which records the table covers; sigma starts at `noise` (V)."""
         tau, signal, size = self._table_responses
+        coordinates = inputs.table["observed"]
         products = coordinates[:, : len(signal)] @ signal
         best = np.argmax(np.where(products > 0.0, products**2 / size, -1.0), axis=1)
         highest = products[np.arange(len(best)), best]
         in_table = (best > 0) & (best < len(tau) - 1) & (highest > 0.0)
         start = self.starting_points(highest / size[best], tau[best])
-        records = RecordInputs({"observed": coordinates}, np.zeros((len(best), len(LINEAR_NUISANCES))), noise_floor)
         clock, tolerance = np.append(self.basis.clock, 0.0), np.asarray(self.settings.loop_tolerance)
-        noise = np.maximum(noise, noise_floor)
-        return find_optima(self.likelihood, self.settings, clock, tolerance, records, start, noise), in_table
+        noise = np.maximum(noise, inputs.noise_floor)
+        return find_optima(self.likelihood, self.settings, clock, tolerance, inputs, start, noise), in_table
 
     @functools.cached_property
     def _table_responses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

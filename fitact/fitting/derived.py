@@ -155,7 +155,7 @@ def draw_derived(
     """Return the quantities of `DERIVED_NAMES` at points of a posterior; unknown charges are drawn for each point."""
     deviates, theta = nuisance_deviates(likelihood, points, seed), points[..., : -len(likelihood.channels)]
     derive = derive.tabulate(theta.reshape(-1, theta.shape[-1]))
-    return evaluate_draws(_derive_draw, derive, derive.time.size, points, deviates)
+    return evaluate_draws(derive_draw, derive, derive.time.size, points, deviates)
 
 
 def draw_force(
@@ -195,7 +195,8 @@ def evaluate_draws(
     return BatchEvaluator(function, model, rows).map_over(points.shape[:-1], points, deviates)
 
 
-def _derive_draw(derive: DerivedQuantities, point: Array, deviate: Array) -> Array:
+def derive_draw(derive: DerivedQuantities, point: Array, deviate: Array) -> Array:
+    """Return the quantities of `DERIVED_NAMES` at a point of the posterior."""
     theta, log_sigma = derive.likelihood.split(point)
     return derive(theta, jnp.exp(log_sigma), deviate)
 

@@ -1,7 +1,7 @@
 """Convergence diagnostics: autocorrelation time, split-R-hat, stuck walkers and importance weights.
 
 Autocorrelation time and R-hat follow emcee and ArviZ, but treat all walkers at once. For a chain of 1,500 steps the
-functions of emcee and ArviZ take 2.6 and 1.4 times as long, and R-hat of a batch of short chains up to 3 times.
+functions of emcee and ArviZ take 2.6 and 1.4 times as long.
 """
 
 import dataclasses
@@ -218,9 +218,12 @@ def pareto_smooth(log_weights: Float[np.ndarray, " draws"]) -> ImportanceWeights
 
 
 def diagnose_weights(
-    level: str, importance: ImportanceWeights, quantities: dict[str, np.ndarray], n_resampled: int
+    level: str, importance: ImportanceWeights, quantities: dict[str, np.ndarray], n_resampled: float
 ) -> Convergence:
-    """Return the effective sizes of `n_resampled` draws, and for "laplace" the errors of the approximation."""
+    """Return the effective sizes of `n_resampled` draws, and for "laplace" the errors of the approximation.
+
+    `n_resampled` is inf where the draws are used with their weights.
+    """
     shift, widening, quantities = {}, {}, _varying(quantities)
     if level == "psis":  # the variances of weighting and of resampling add up
         effective = {name: importance.effective_size(values) for name, values in quantities.items()}

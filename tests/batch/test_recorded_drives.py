@@ -8,6 +8,7 @@ import scipy.signal
 
 import fitact
 from fitact.batch.fit_many import RecordGroup
+from tests.batch.test_many_posteriors import assert_quantiles_of_separate_posterior
 
 NAMES = ("Rsc", "Csc", "Ci")
 MEDIANS, RELATIVE_SDS = np.array([130e3, 18e-9, 1.35e-9]), np.array([0.5, 0.5, 0.05])
@@ -156,3 +157,18 @@ def test_the_force_of_long_records_is_that_of_their_last_periods():
     rows = fitact.fit_many(records, SCENE, progress=False)
     for number in (0, 15):
         assert_equal_to_separate_fit(rows[number], records[number])
+
+
+def test_posteriors_are_those_of_each_by_itself():
+    """The channels are noisy, late by a part of a step, and rounded to 14 bits of 800 V and 80 V."""
+    records = []
+    for number in range(18):
+        made = record(number)
+        rounded = {"V": np.round(made["V"] / 0.05) * 0.05, "Vsc": np.round(made["Vsc"] / 0.005) * 0.005}
+        records.append(change(number, **rounded))
+    rows = fitact.sample_many(records, SCENE, seed=1, progress=False)
+    assert sum(row["level"] == "psis" for row in rows) >= 16
+    assert all(row["trusted"] for row in rows)
+    for number in (0, 7):
+        assert rows[number]["level"] == "psis"
+        assert_quantiles_of_separate_posterior(rows[number], fitact.fit(records[number], SCENE))
