@@ -1,4 +1,8 @@
-"""Least squares for many compressed records at once: Gauss-Newton steps, and which nuisances the residuals favour."""
+"""Least squares for many compressed records at once: Gauss-Newton steps, and which nuisances the residuals favour.
+
+Records are near their optimum, so that steps need no trust region. The optimiser of single fits would take nine times
+as long (68 us per record against 7.5 us), and that without the noise and the nuisances.
+"""
 
 import dataclasses
 import functools
@@ -164,7 +168,7 @@ def _find_optimum(
     whitened, jacobian = linearise(theta, sigma)
     residuals, (r_factor, projections) = sigma * whitened[:rows], decompose_qr(jacobian, whitened)
     is_possible = jnp.isfinite(model.log_prob(jnp.append(theta, jnp.log(sigma))))
-    r_squared = _r_squared(channel, model.channel_inputs(theta), clock, residuals, jacobian[:rows])
+    r_squared = _r_squared(channel, model.channel_inputs(theta), clock, whitened, jacobian)
     fitted, converged = channel.whitened_observed() - residuals, jnp.linalg.norm(projections) <= settings.tolerance
     return GaussNewtonResult(theta, sigma, residuals @ residuals, r_factor, r_squared, fitted, converged & is_possible)
 
@@ -172,12 +176,17 @@ def _find_optimum(
 def _r_squared(
     channel: ChannelLikelihood, inputs: ChannelInputs, clock: Array, residuals: Array, jacobian: Array
 ) -> Float[Array, " nuisances"]:
-    """Return the fraction of the residual sum of squares that each of `CANDIDATES` explains, beside what is fitted."""
+    """Return the fraction of the residual sum of squares that each of `CANDIDATES` explains, beside what is fitted.
+
+    The rows of the prior follow those of the data, as for a single record.
+    """
     table = channel.compression
     assert isinstance(table, Compression)
     places = list(itertools.chain(*NUISANCES.values()))
     candidates = jnp.stack([*(table.baseline[i] for i in places), channel.whitened_delay_derivative(inputs), clock])
     shapes = channel.residuals_and_shapes(inputs)[1] * (channel.linear_sd[np.array(channel.columns, int), None] > 0.0)
+    off_prior = residuals.size - channel.rows
+    candidates, shapes = (jnp.pad(each, ((0, 0), (0, off_prior))) for each in (candidates, shapes))
     columns = [*jacobian.T, *shapes]
     fitted = jnp.stack(_orthonormalise(columns, [_TOLERANCE * jnp.linalg.norm(column) for column in columns]))
     rest, min_lengths = candidates, _TOLERANCE * jnp.linalg.norm(candidates, axis=1)
@@ -187,7 +196,7 @@ def _r_squared(
     groups = [slice(*ends) for ends in itertools.pairwise(starts.tolist())]
     bases = [_orthonormalise(list(rest[group]), list(min_lengths[group])) for group in groups]
     explained = [sum(jnp.square(q @ residuals) for q in basis) for basis in bases]
-    return jnp.stack(explained) / (residuals @ residuals)
+    return jnp.stack(explained) / jnp.sum(jnp.square(residuals[: channel.rows]))
 
 
 def _orthonormalise(columns: list[Array], min_lengths: Sequence[ArrayLike]) -> list[Array]:

@@ -19,11 +19,18 @@ from fitact.batch.gauss_newton import decompose_qr, substitute_back
 from fitact.compiled import jit, map_blocks
 from fitact.likelihood.compression import BASELINE_NAMES, Compression
 from fitact.likelihood.projection import MAX_DELAY, evaluate_baseline, uniform_recurrence
-from fitact.model.response_table import NODES, TABLE_HALF_WIDTH, ResponseTable, chebyshev, chebyshev_polynomials
+from fitact.model.response_table import (
+    NODES,
+    TABLE_HALF_WIDTH,
+    ResponseTable,
+    chebyshev,
+    chebyshev_polynomials,
+    count_nodes,
+)
 
 HALF_WIDTH = 0.05  # of a record's table, in log tau
 AGES = 1  # time steps by which the delay of a record may differ from that of the first
-TABLE_NODES = 5  # of a record's table, with which its responses are exact to 1e-9
+TABLE_NODES = count_nodes(HALF_WIDTH, 2e-9)
 RECORD_BLOCK = 4  # records whose functions are computed at once; see `map_blocks`
 _BLOCK = 50  # samples whose responses are computed one after the other, in parallel with other blocks
 

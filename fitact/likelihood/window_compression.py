@@ -32,9 +32,9 @@ from fitact.likelihood.projection import (
     evaluate_baseline,
     factor_products,
 )
+from fitact.model.response_table import count_nodes
 
 REACH = 4.0  # factor by which b may change
-REACH_NODES = 21  # of the table, whose series then ends at 1e-8
 RANK = 14  # combinations of responses that represent those of the table, to 2e-7
 TREND_RANK = 6  # combinations of responses that represent those to a small trend, to 0.3 %
 
@@ -77,7 +77,7 @@ class WindowCompressor:
     ) -> Self:
         """Make the tables around the time constants of a circuit, a factor `REACH` either way."""
         time = step * np.arange(samples)
-        reach = (math.log(REACH), REACH_NODES) if len(circuit.tau) == 1 else None
+        reach = (math.log(REACH), count_nodes(math.log(REACH), 1e-8)) if len(circuit.tau) == 1 else None
         tables, shared = [], []
         for each in channels:
             table = TableNodes.from_terms(circuit.terms[each.channel], time, narrow=False, reach=reach)

@@ -22,11 +22,21 @@ from fitact.model.drive import Drive
 from fitact.model.harmonic import mean_voltage
 from fitact.model.response import highpass
 
-NODES = 41  # odd, so that the middle of the table is a node
-TABLE_HALF_WIDTH = math.log(9.0)  # half-width in log tau that `NODES` cover to rounding
-_MARGIN = 0.05  # least half-width of a `ResponseTable`, in log tau
+
+def count_nodes(half_width: float, precision: float = 2e-12) -> int:
+    """Return how many nodes give e^{-t/tau} at any age t to this precision, for log tau within ± `half_width`.
+
+    It is analytic within a strip of half-width pi / 2, which contains an ellipse around the range: coefficients fall
+    by the factor e^asinh(pi / (2 half_width)) from one to the next. The number is odd: the middle is a node.
+    """
+    terms = math.ceil(-math.log(precision) / math.asinh(0.5 * math.pi / half_width))
+    return terms + (terms % 2 == 0)
+
+
+TABLE_HALF_WIDTH = math.log(9.0)  # half-width of a table, in log tau
 NARROW = 0.2  # half-width in log tau of a narrow table
-_FEW_NODES = 11  # nodes of a narrow table
+NODES = count_nodes(TABLE_HALF_WIDTH)
+_MARGIN = 0.05  # least half-width of a `ResponseTable`, in log tau
 _MAX_HALF_WIDTH = 4.0 * TABLE_HALF_WIDTH  # beyond it, a table costs more than it saves
 _MAX_NUMBERS = 4_000_000  # responses of all nodes at all times, which bounds the memory
 _PRECISION = 1e-13  # of a `ResponseTable`, relative to the largest response
@@ -99,8 +109,8 @@ class ResponseTable(eqx.Module):
 
 
 def node_count(half_width: float) -> int:
-    """Return how many nodes reach rounding: e^{-t/tau} is analytic in log tau within a strip of half-width pi / 2."""
-    return _FEW_NODES if half_width <= NARROW else NODES * math.ceil(half_width / TABLE_HALF_WIDTH)
+    """Return the nodes of a table, one of few numbers, so that few programs are compiled; see `count_nodes`."""
+    return count_nodes(NARROW) if half_width <= NARROW else NODES * math.ceil(half_width / TABLE_HALF_WIDTH)
 
 
 @functools.lru_cache(maxsize=64)
