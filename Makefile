@@ -6,8 +6,8 @@ export JAX_COMPILATION_CACHE_DIR = $(CURDIR)/out/jax
 export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS = 0
 # a test runs what it compiles once or twice: XLA compiles in a third of the time where it optimises less; all else that
 # is made here runs as users' programs do, and `make test TEST_XLA_FLAGS=` tests those. JAX 0.11 and later, of Python 3.12,
-# end where a flag is unknown, as the first is to them
-TEST_XLA_FLAGS = $(shell $(PY) -c 'from fitact.compiled import XLA_OPTIONS as o; print("--xla_cpu_use_fusion_emitters=false" * ("xla_cpu_use_fusion_emitters" in o))') \
+# end where a flag is unknown, as the first is to them; there, the others are left out, too
+TEST_XLA_FLAGS = $(shell $(PY) -c 'from fitact.compiled import XLA_OPTIONS as o; print(("--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 --xla_llvm_disable_expensive_passes=true") * ("xla_cpu_use_fusion_emitters" in o))') \
   --xla_backend_optimization_level=0
 PYTEST = XLA_FLAGS="$(TEST_XLA_FLAGS)" $(PY) -m pytest -n auto
 .DEFAULT_GOAL = help

@@ -176,7 +176,7 @@ def optimum_seconds(records: list[fitact.Record]) -> float:
     """Return the seconds per record for the optimum alone, with known noise."""
     batches = [np.stack([record["Vsc"] for record in records[i : i + 256]]) for i in range(0, len(records) - 255, 256)]
     with jax.enable_x64(True), threadpool_limits(1):
-        together = StatedDriveProblem.from_problem(build_problem([records[0]], [SCENE]))
+        together = StatedDriveProblem.from_problem(build_problem([records[0]], [SCENE]), 256)
         noise, least = np.full(256, NOISE), np.zeros(256)
         jax.block_until_ready(
             together.find_optima(together.make_inputs(together.basis.project(batches[0]), least), noise)[0]

@@ -91,7 +91,8 @@ class BatchProblem(abc.ABC):
         phases: phase bins of the samples in the drive's period, or None if there are too few periods.
         samples: number of samples of each record that are fitted.
         optional_nuisances: nuisances that a record may need.
-        unit: number of records in a batch, for which programs are compiled.
+        unit: number of records in a batch, for which programs are compiled: `large_unit`, or `small_unit` if there are
+            no more, as in a task of a campaign.
     """
 
     likelihood: Likelihood
@@ -99,8 +100,10 @@ class BatchProblem(abc.ABC):
     phases: PhaseBins | None
     samples: int
     optional_nuisances: tuple[str, ...]
+    unit: int
     settings: ClassVar[GaussNewton] = GaussNewton()
-    unit: ClassVar[int]
+    large_unit: ClassVar[int]
+    small_unit: ClassVar[int] = 32
 
     @abc.abstractmethod
     def includes(self, record: Record) -> bool:
@@ -109,6 +112,11 @@ class BatchProblem(abc.ABC):
     @abc.abstractmethod
     def fit(self, records: Sequence[Record], whiteness: bool = True) -> BatchFit:
         """Fit `unit` records, and optionally test the residuals for structure (`whiteness`), in double precision."""
+
+    @classmethod
+    def choose_unit(cls, count: int) -> int:
+        """Return the `unit` for `count` records."""
+        return cls.small_unit if count <= cls.small_unit else cls.large_unit
 
     def pad_records(self, members: Sequence[tuple[int, Record]]) -> list[Record]:
         """Return `unit` records, the last one repeatedly."""

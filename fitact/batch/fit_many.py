@@ -251,7 +251,7 @@ class RecordGroup:
                 break
             self.tries -= 1
             try:
-                self.batch_problem = _make_batch_problem(record, scene)
+                self.batch_problem = _make_batch_problem(record, scene, len(self.members))
             except (InputError, np.linalg.LinAlgError):
                 continue
         return self.batch_problem is not None
@@ -289,16 +289,16 @@ def _split_group(group: RecordGroup, scene: Scene | None) -> Iterator[Batch]:
     group.members = []
 
 
-def _make_batch_problem(record: Record, scene: Scene | None) -> BatchProblem | None:
-    """Return the problem for records like this one, or None if they cannot be fitted in batches."""
+def _make_batch_problem(record: Record, scene: Scene | None, count: int) -> BatchProblem | None:
+    """Return the problem for `count` records like this one, or None if they cannot be fitted in batches."""
     if scene is not None and (scene.geometry_distributions() or "Ft" in scene.measurement.channels):
         return None  # batches draw no geometry, and have no friction
     problem = build_problem([record], [scene])
     if problem.likelihood.channels[0].effect_sizes:  # whose functions differ between records
         return None
     if problem.sources[0].choice.name != "measured":
-        return StatedDriveProblem.from_problem(problem)
-    return RecordedDriveProblem.from_fit(fit(record, scene), problem)
+        return StatedDriveProblem.from_problem(problem, count)
+    return RecordedDriveProblem.from_fit(fit(record, scene), problem, count)
 
 
 def fit_batch(batch: Batch, whiteness: bool = True) -> tuple[dict[int, Row], BatchFit | None]:

@@ -69,7 +69,7 @@ class RecordedDriveProblem(BatchProblem):
             the drive does not repeat.
     """
 
-    unit, settings = 64, GaussNewton(block=32)
+    large_unit, settings = 128, GaussNewton(block=32)
     shared: SharedFunctions
     linear_sd: Float[np.ndarray, " nuisances"]
     gain_sd: float
@@ -78,8 +78,8 @@ class RecordedDriveProblem(BatchProblem):
     repeat: int | None
 
     @classmethod
-    def from_fit(cls, fitted: Fit, problem: Problem) -> Self | None:
-        """Make the problem for records like that of a fit to `problem`, or None if they cannot be fitted in batches.
+    def from_fit(cls, fitted: Fit, problem: Problem, count: int) -> Self | None:
+        """Make the problem for `count` records like that of a fit to `problem`, or None if batches cannot fit them.
 
         A delay is fitted in all records if it was fitted in this one.
         """
@@ -119,6 +119,7 @@ class RecordedDriveProblem(BatchProblem):
             phases=PhaseBins.from_times(time[counted], frequency),
             samples=counted.size,
             optional_nuisances=optional,
+            unit=cls.choose_unit(count),
             shared=shared,
             linear_sd=linear_sd,
             gain_sd=log_sd(fitted.scene.measurement.gain_relative_sd),

@@ -36,13 +36,13 @@ _CHUNK = 64  # records whose samples are processed together, so that they stay i
 class StatedDriveProblem(BatchProblem):
     """Records under one drive, which share a `basis`; a record that needs a nuisance is fitted separately."""
 
-    unit = 256
+    large_unit = 256
     basis: SharedBasis
     voltage: Float[np.ndarray, " samples"]  # drive at the samples, V
 
     @classmethod
-    def from_problem(cls, problem: Problem) -> Self | None:
-        """Make the problem for records like the one of `problem`, or None if they cannot be fitted in batches.
+    def from_problem(cls, problem: Problem, count: int) -> Self | None:
+        """Make the problem for `count` records like the one of `problem`, or None if batches cannot fit them.
 
         Double precision is required.
         """
@@ -73,6 +73,7 @@ class StatedDriveProblem(BatchProblem):
             phases=PhaseBins.from_times(time, record.frequency() if choice.periodic else None),
             samples=time.size,
             optional_nuisances=source.optional_nuisances,
+            unit=cls.choose_unit(count),
             basis=basis,
             voltage=choice.voltage,
         )
