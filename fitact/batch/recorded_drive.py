@@ -211,7 +211,7 @@ class RecordedDriveProblem(BatchProblem):
         """Solve the least squares, and add nuisances to each record while the BIC favours one."""
         wide, floor = 10.0 * screened.height, MIN_RELATIVE_NOISE * screened.height  # as for a single record
         linear_sd, noise = self.linear_sd * screened.height[:, None], np.maximum(screened.noise, floor)
-        fields, clock = self._select(tables.fields()), np.zeros(tables.observed.shape[1])
+        fields, clock = self._select(tables.fields()), np.zeros(tables.coordinates.shape[1])
         tolerance = self.settings.first_tolerance
         while True:
             inputs = RecordInputs(fields, linear_sd, floor, gain_sd)

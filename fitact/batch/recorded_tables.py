@@ -17,8 +17,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from fitact.batch.gauss_newton import decompose_qr, substitute_back
 from fitact.compiled import jit, map_blocks
-from fitact.likelihood.compression import BASELINE_NAMES, Compression
-from fitact.likelihood.projection import MAX_DELAY, evaluate_baseline, uniform_recurrence
+from fitact.likelihood.compression import BASELINE_NAMES, Compression, split_functions
+from fitact.likelihood.projection import MAX_DELAY, evaluate_baseline, root_products, uniform_recurrence
 from fitact.model.response_table import (
     NODES,
     TABLE_HALF_WIDTH,
@@ -117,15 +117,14 @@ def table_nodes(tau: Float[Array, ""]) -> Float[Array, " nodes"]:
 class Tables(NamedTuple):
     """Compressions of records, in terms of functions of time.
 
-    The functions of a record are those that all share, the responses at the nodes of its table, and the steps of its
-    drive.
+    The functions of a record are those that all share, the responses at the nodes of its table, the steps of its drive,
+    and the record itself.
 
     Attributes:
         g, b: estimates of the parameters, around which each table lies (b in s).
         is_possible: whether they could be estimated.
         decay: decays of an unknown charge at the nodes, in the shared functions.
         coordinates: orthogonal coordinates of the functions, with the inner products over the fitted samples.
-        observed: the same for the record.
     """
 
     shared: SharedFunctions
@@ -134,7 +133,6 @@ class Tables(NamedTuple):
     is_possible: Bool[np.ndarray, " records"]
     decay: Float[np.ndarray, "records shared nodes"]
     coordinates: Float[np.ndarray, "records rows functions"]
-    observed: Float[np.ndarray, "records rows"]
 
     @classmethod
     def from_records(
@@ -143,32 +141,33 @@ class Tables(NamedTuple):
         """Tabulate the responses of each record."""
         g, b, is_possible, decay, across, products = _multiply_functions(shared, V, Vsc)
         scale = np.sqrt(np.einsum("rii->ri", products))
-        rest = _factor_products(products - np.swapaxes(across, 1, 2) @ across, scale)
-        columns = np.concatenate([across, rest], axis=1)
-        first = np.broadcast_to(np.eye(columns.shape[1], shared.size), (len(V), columns.shape[1], shared.size))
-        coordinates = np.concatenate([first, columns[:, :, :-1]], axis=2)
-        return cls(shared, g, b, is_possible, decay, coordinates, columns[:, :, -1])
+        rest, *_ = root_products(products - np.swapaxes(across, 1, 2) @ across, scale)
+        own = np.concatenate([across, rest], axis=1)
+        first = np.broadcast_to(np.eye(own.shape[1], shared.size), (len(V), own.shape[1], shared.size))
+        return cls(shared, g, b, is_possible, decay, np.concatenate([first, own], axis=2))
 
     def fields(self, *, in_functions: bool = False) -> dict[str, np.ndarray]:
         """Return the fields of `Compression` that differ between records, by name.
 
         If `in_functions`, the coordinates are instead coefficients of the functions, and the record is 0.
         """
-        records, _, functions = self.coordinates.shape
-        to_rows = (
-            np.broadcast_to(np.eye(functions), (records, functions, functions)) if in_functions else self.coordinates
-        )
-        rows, size, series = to_rows.shape[1], self.shared.size, chebyshev(TABLE_NODES)[1].T
+        columns = self.coordinates
+        if in_functions:
+            *_, count = columns.shape
+            columns = np.broadcast_to(np.eye(count - 1, count), (len(columns), count - 1, count))
+        records, rows, _ = columns.shape
+        size, series = self.shared.size, chebyshev(TABLE_NODES)[1].T
+        found = split_functions(columns, {"shared": size, "signal": TABLE_NODES, "steps": 2 * AGES, "observed": 1})
+        steps = np.swapaxes(found["steps"], 1, 2) / self.shared.time_step
         zeros, missing = np.zeros((records, rows)), ((0, 0), (0, rows - size))
-        steps = np.swapaxes(to_rows[:, :, size + TABLE_NODES :], 1, 2) / self.shared.time_step
         return {
             "center": np.log(self.b),
-            "signal": to_rows[:, :, size : size + TABLE_NODES] @ series,
+            "signal": found["signal"] @ series,
             "decay": np.pad(self.decay @ series, (*missing, (0, 0))),
             "baseline": np.tile(np.pad(self.shared.baseline, missing), (records, 1, 1)),
             "rate": zeros,
             "slope": 0.5 * (steps[:, AGES - 1] + steps[:, AGES]),
-            "observed": zeros if in_functions else self.observed,
+            "observed": found["observed"][..., 0],
             "observed_slope": zeros,
             "steps": steps,
         }
@@ -178,15 +177,6 @@ def to_response_table(table: Compression) -> ResponseTable:
     """Return a table of coefficients from a compression in functions; the response is not delayed."""
     signal = jnp.pad(table.signal, ((0, 0), (0, 1)))
     return ResponseTable(table.center[None], table.half_width, signal, table.decay, jnp.eye(TABLE_NODES), 0.0)
-
-
-def _factor_products(
-    products: Float[np.ndarray, "records n n"], scale: Float[np.ndarray, "records n"]
-) -> Float[np.ndarray, "records n n"]:
-    """Return coordinates (columns) that have these inner products, to rounding relative to the squares of `scale`."""
-    scale = np.where(scale > 0.0, scale, 1.0)
-    values, vectors = np.linalg.eigh(products / (scale[:, :, None] * scale[:, None, :]))
-    return np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2) * scale[:, None, :]
 
 
 @functools.partial(jit, fast=True)

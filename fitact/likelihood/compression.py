@@ -31,7 +31,7 @@ BASELINE_NAMES = (
     *(f"hum_{frequency:.0f}Hz_{part}" for frequency in HUM_FREQUENCIES for part in ("cos", "sin")),
 )
 
-Columns = Float[np.ndarray, "rows functions"]
+Columns = Float[np.ndarray, "*records rows functions"]
 
 
 def function_sizes(rank: int, *, decays: bool, effects: int = 0, ages: int = 0) -> dict[str, int]:
@@ -51,7 +51,7 @@ def place_functions(sizes: Mapping[str, int]) -> dict[str, Int[np.ndarray, " fun
 
 def split_functions(columns: Columns, sizes: Mapping[str, int]) -> dict[str, Columns]:
     """Return columns by the name of the functions to which they belong."""
-    return {name: columns[:, place] for name, place in place_functions(sizes).items()}
+    return {name: columns[..., place] for name, place in place_functions(sizes).items()}
 
 
 def orthogonal_coordinates(functions: Mapping[str, Columns]) -> dict[str, Columns]:

@@ -548,10 +548,22 @@ def factor_products(
 
 def _factor(total: np.ndarray, products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     scale = np.sqrt(np.abs(np.diagonal(total)))
-    scale[scale == 0.0] = 1.0
-    values, vectors = np.linalg.eigh(total / np.outer(scale, scale))
-    roots = np.sqrt(np.maximum(values, 0.0))
-    rotation, rows = np.linalg.qr(roots[:, None] * vectors.T * scale)
+    roots, values, vectors = root_products(total, scale)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    rotation, rows = np.linalg.qr(roots)
     kept = values > 1e-11 * values[-1]  # what the others may not be projected on lies within rounding
-    inverse = np.where(kept, 1.0 / np.where(kept, roots, 1.0), 0.0)
+    inverse = np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
     return rows, rotation.T @ (inverse[:, None] * (vectors.T @ (products / scale[:, None])))
+
+
+def root_products(
+    products: Float[np.ndarray, "*any n n"], scale: Float[np.ndarray, "*any n"]
+) -> tuple[Float[np.ndarray, "*any n n"], Float[np.ndarray, "*any n"], Float[np.ndarray, "*any n n"]]:
+    """Return columns that have these inner products, to rounding relative to the squares of `scale`.
+
+    Also return the eigenvalues and eigenvectors of the scaled products.
+    """
+    scale = np.where(scale > 0.0, scale, 1.0)
+    values, vectors = np.linalg.eigh(products / (scale[..., :, None] * scale[..., None, :]))
+    roots = np.sqrt(np.maximum(values, 0.0))[..., None] * np.swapaxes(vectors, -1, -2)
+    return roots * scale[..., None, :], values, vectors
