@@ -252,7 +252,7 @@ def fill(size: float) -> None:
 
 @pytest.mark.slow
 def test_a_worker_that_is_nearly_full_goes_on():
-    with module._open_client(None, 1, "1 GiB", module._Progress(0, False), 0.0) as client:
+    with module._open_client(None, 1, "1 GiB", False, 0.0) as client:
         client.submit(fill, 0.88 * 2**30).result(timeout=60)  # Dask would pause the worker above 0.8
         assert client.submit(os.getpid).result(timeout=60) != os.getpid()
 
