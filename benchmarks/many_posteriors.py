@@ -63,8 +63,6 @@ if __name__ == "__main__":
     parser.add_argument("--records", type=int, default=128, help="16 or more")
     parser.add_argument("--samples", type=int, default=2_000)
     options = parser.parse_args()
-    own = simulate_recorded(options.records, options.samples)
-    found = measure(simulate_records(options.records, options.samples), SCENE) | measure(
-        own, RECORDED_SCENE, "recorded_"
-    )
-    show(found, options.json)
+    size = options.records, options.samples
+    found = measure(simulate_records(*size), SCENE)
+    show(found | measure(simulate_recorded(*size), RECORDED_SCENE, "recorded_"), options.json)

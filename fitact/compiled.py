@@ -68,12 +68,10 @@ def pad_weight(weight: np.ndarray, samples: int | None = None) -> np.ndarray:
     return pad_samples(weight, samples, mode="constant")
 
 
-def pad_rows(values: np.ndarray, size: int, axis: int = 0) -> np.ndarray:
+def pad_rows(values: np.ndarray, size: int) -> np.ndarray:
     """Return rows padded to an integer number of batches of `size` by repeating the last."""
-    missing = -values.shape[axis] % size
-    if not missing:
-        return values
-    return np.concatenate([values, np.repeat(np.take(values, [-1], axis), missing, axis)], axis)
+    missing = -len(values) % size
+    return np.concatenate([values, np.repeat(values[-1:], missing, axis=0)]) if missing else values
 
 
 def empty_aligned(shape: tuple[int, ...]) -> np.ndarray:

@@ -27,6 +27,8 @@ from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.model.response_table import ResponseTable
 from fitact.problem.starting_point import most_probable_skin, prior_skin_moments
 
+SAMPLE_BLOCK = 16  # records whose residuals are tested at once; see `map_blocks`
+
 _Rows = TypeVar("_Rows", np.ndarray, list[Any])
 _Tree = TypeVar("_Tree")
 

@@ -215,16 +215,16 @@ def run_in_threads(
         with double_precision():  # x64 is a setting of each thread
             return work(job)
 
-    with ThreadPoolExecutor(cores) as pool:
-        try:
-            for job in jobs:
-                under_way.append((job, pool.submit(run_job, job)))
-                if len(under_way) > jobs_per_core * cores:
-                    first, result = under_way.popleft()
-                    yield first, result.result()
-            yield from ((job, result.result()) for job, result in under_way)
-        finally:
-            pool.shutdown(cancel_futures=True)  # after an interruption, what has not begun
+    pool = ThreadPoolExecutor(cores)
+    try:
+        for job in jobs:
+            under_way.append((job, pool.submit(run_job, job)))
+            if len(under_way) > jobs_per_core * cores:
+                first, result = under_way.popleft()
+                yield first, result.result()
+        yield from ((job, result.result()) for job, result in under_way)
+    finally:
+        pool.shutdown(cancel_futures=True)  # after an interruption, what has not begun
 
 
 @dataclasses.dataclass

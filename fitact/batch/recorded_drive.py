@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fitact.batch.batch_problem import BatchFit, BatchProblem, Screening, stack_channel
+from fitact.batch.batch_problem import SAMPLE_BLOCK, BatchFit, BatchProblem, Screening, stack_channel
 from fitact.batch.gauss_newton import GaussNewton, GaussNewtonResult, RecordInputs, find_optima
 from fitact.batch.recorded_tables import (
     AGES,
@@ -21,10 +21,9 @@ from fitact.batch.recorded_tables import (
     TABLE_NODES,
     SharedFunctions,
     Tables,
+    make_response_table,
     table_nodes,
-    to_response_table,
 )
-from fitact.batch.shared_basis import SAMPLE_BLOCK
 from fitact.compiled import jit, map_blocks
 from fitact.data.record import Record, rounding_noise_sd
 from fitact.fitting.derived import DerivedQuantities
@@ -275,7 +274,9 @@ def _evaluate_optimum(
     remainder, shapes = functions.residuals_and_shapes(inputs)  # of a record that is 0
     fitted = (beta * channel.linear_sd[np.array(channel.columns, dtype=int)]) @ shapes - remainder
     assert isinstance(functions.compression, Compression)
-    derive = dataclasses.replace(derive, likelihood=model, drive=to_response_table(functions.compression))
+    table = functions.compression  # whose rows are coefficients
+    drive = make_response_table(table.center, table.signal, table.decay)
+    derive = dataclasses.replace(derive, likelihood=model, drive=drive)
 
     def quantities(theta: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         circuit = model.circuit(theta)
@@ -370,8 +371,6 @@ def _tabulate_responses(
             jnp.pad(series.T @ each[:, begin : begin + count], ((0, 0), (0, max(begin + count - v.size, 0)))).T
             for each in (own, decays)
         )
-        half_width, zero = jnp.asarray(HALF_WIDTH), jnp.zeros(())
-        signal = jnp.pad(signal, ((0, 0), (0, 1)))
-        return ResponseTable(center[None], half_width, signal, decay, jnp.eye(TABLE_NODES), zero)
+        return make_response_table(center, signal, decay)
 
     return map_blocks(tabulate_record, (center, V), RECORD_BLOCK)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from fitact.batch.gauss_newton import decompose_qr, substitute_back
 from fitact.compiled import jit, map_blocks
-from fitact.likelihood.compression import BASELINE_NAMES, Compression, split_functions
+from fitact.likelihood.compression import BASELINE_NAMES, split_functions
 from fitact.likelihood.projection import MAX_DELAY, evaluate_baseline, root_products, uniform_recurrence
 from fitact.model.response_table import (
     NODES,
@@ -173,10 +173,12 @@ class Tables(NamedTuple):
         }
 
 
-def to_response_table(table: Compression) -> ResponseTable:
-    """Return a table of coefficients from a compression in functions; the response is not delayed."""
-    signal = jnp.pad(table.signal, ((0, 0), (0, 1)))
-    return ResponseTable(table.center[None], table.half_width, signal, table.decay, jnp.eye(TABLE_NODES), 0.0)
+def make_response_table(
+    center: Float[Array, ""], signal: Float[Array, "rows terms"], decay: Float[Array, "rows terms"]
+) -> ResponseTable:
+    """Return a record's table, undelayed, from Chebyshev coefficients of values at times or of other coefficients."""
+    signal = jnp.pad(signal, ((0, 0), (0, 1)))
+    return ResponseTable(center[None], jnp.asarray(HALF_WIDTH), signal, decay, jnp.eye(TABLE_NODES), jnp.zeros(()))
 
 
 @functools.partial(jit, fast=True)

@@ -41,8 +41,6 @@ from fitact.scene.scene import Scene
 from fitact.summary import PROBABILITIES
 
 _BLOCK = 32  # records sampled together, padded to this number
-_DRAWS = 8192  # of each posterior
-_DERIVED_DRAWS = 2048  # of these, for which derived quantities are computed, which cost more
 _TRACKED = ("g", "b", "force_mean")
 _CONVERGENCE_COLUMNS = ("converged", "level", "ess_min", "k_hat", "rhat_max")
 
@@ -154,9 +152,16 @@ def _make_targets(batch: Batch) -> _Targets | None:
 
 
 def _sample_block(
-    job: tuple[list[Member], _Targets | None], seed: int, draws: int = _DRAWS, min_effective: float = 2000.0
+    job: tuple[list[Member], _Targets | None],
+    seed: int,
+    draws: int = 8192,
+    derived_draws: int = 2048,
+    min_effective: float = 2000.0,
 ) -> dict[int, Row]:
-    """Sample a block, and return the rows of records whose weights are reliable and not too uneven."""
+    """Sample a block, and return the rows of records whose weights are reliable and not too uneven.
+
+    Derived quantities, which cost more, are computed for the first `derived_draws` of the draws.
+    """
     members, targets = job
     if targets is None:
         return {}
@@ -164,9 +169,9 @@ def _sample_block(
     generators = [np.random.default_rng([seed, int(record.fingerprint, 16)]) for _, record in full.members]
     z = np.stack([draw_student_t(each, draws, full.centers.shape[1]) for each in generators])
     points = full.centers[:, None] + z @ np.swapaxes(full.factors, 1, 2)
-    log_ratios = evaluate_log_probs(full.likelihood, full.inputs, points) - student_log_density(z)
-    deviates = np.stack([each.standard_normal((_DERIVED_DRAWS, 1, len(LINEAR_NUISANCES))) for each in generators])
-    some = points[:, :_DERIVED_DRAWS]
+    log_ratios = _evaluate_log_probs(full.likelihood, full.inputs, points) - student_log_density(z)
+    deviates = np.stack([each.standard_normal((derived_draws, 1, len(LINEAR_NUISANCES))) for each in generators])
+    some = points[:, :derived_draws]
     quantities = _derive_draws(full.derive, full.likelihood, full.inputs, full.tables, some, deviates)
     names, rows = (*full.likelihood.names, "sigma"), {}
     for i, ((number, _), row) in enumerate(zip(members, targets.rows, strict=True)):
@@ -185,7 +190,7 @@ def _sample_block(
 
 
 @functools.partial(jit, fast=True)
-def evaluate_log_probs(
+def _evaluate_log_probs(
     likelihood: Likelihood, inputs: RecordInputs, points: Float[Array, "records draws n"]
 ) -> Float[Array, "records draws"]:
     """Return the log-posteriors of the points of each record; NaN outside its table."""
@@ -217,21 +222,14 @@ def _derive_draws(
 def _posterior_columns(
     row: Row, draws: Mapping[str, np.ndarray], convergence: Convergence, weights: ImportanceWeights | None = None
 ) -> Row:
-    """Return the posterior quantiles of the quantities in a row, and convergence diagnostics.
-
-    `weights` are those of the first draws.
-    """
+    """Return the posterior quantiles of the quantities in a row, and convergence diagnostics."""
+    quantiles = np.quantile if weights is None else weights.quantiles
     columns: Row = {}
     for key in row:
         name = "sigma" if key == "noise" else key
         if name in draws:
-            values, probabilities = draws[name], list(PROBABILITIES.values())
-            if weights is None:
-                quantiles = np.quantile(values, probabilities)
-            else:
-                weight = weights.weights[: len(values)]
-                quantiles = np.quantile(values, probabilities, weights=weight, method="inverted_cdf")
-            columns |= {f"{key}_{q}": float(value) for q, value in zip(PROBABILITIES, quantiles, strict=True)}
+            values = quantiles(draws[name], list(PROBABILITIES.values()))
+            columns |= {f"{key}_{q}": float(value) for q, value in zip(PROBABILITIES, values, strict=True)}
     return columns | {name: getattr(convergence, name) for name in _CONVERGENCE_COLUMNS}
 
 

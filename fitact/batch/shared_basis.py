@@ -18,8 +18,6 @@ from fitact.model.drive import Drive
 from fitact.model.response import highpass
 from fitact.model.response_table import NODES, TABLE_HALF_WIDTH, chebyshev, round_up_column_count
 
-SAMPLE_BLOCK = 16  # records whose samples are processed at once; see `map_blocks`
-
 
 class SharedBasis(NamedTuple):
     """Orthonormal functions over the samples, the first of which span the responses around a central time constant.

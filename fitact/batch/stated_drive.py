@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from fitact.batch.batch_problem import BatchFit, BatchProblem, Screening, split_rows, stack_channel
+from fitact.batch.batch_problem import SAMPLE_BLOCK, BatchFit, BatchProblem, Screening, split_rows, stack_channel
 from fitact.batch.gauss_newton import GaussNewtonResult, RecordInputs, find_optima
-from fitact.batch.shared_basis import SAMPLE_BLOCK, SharedBasis
+from fitact.batch.shared_basis import SharedBasis
 from fitact.compiled import jit, map_blocks
 from fitact.data.record import Record
 from fitact.fitting import derived

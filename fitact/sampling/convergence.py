@@ -5,6 +5,7 @@ functions of emcee and ArviZ take 2.6 and 1.4 times as long.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import emcee
@@ -193,6 +194,10 @@ class ImportanceWeights(NamedTuple):
         weights = self._first_weights(values.size)
         mean = float(weights @ values)
         return mean, float(np.sqrt(weights @ (values - mean) ** 2))
+
+    def quantiles(self, values: Float[np.ndarray, " some"], probabilities: Sequence[float]) -> Float[np.ndarray, " n"]:
+        """Return weighted quantiles of `values`, which belong to the first draws."""
+        return np.quantile(values, probabilities, weights=self._first_weights(values.size), method="inverted_cdf")
 
     def effective_size(self, values: Float[np.ndarray, " some"]) -> float:
         """Return the effective number of all draws for the mean of `values`, which belong to the first draws."""
