@@ -53,19 +53,24 @@ def _is_route_available(path: Path) -> bool:
 
 def _make(path: Path, out: Path, end: str, seed: int | None, route: str | None) -> None:
     from data_synth import files, recipe
-    from data_synth.make import make
+    from data_synth.make import list_truth, make
 
     found = recipe.load(path)
     found = found._replace(seed=found.seed if seed is None else seed, route=route or found.route)
-    folder = out if found.parts["population"]["fingers"] is None else out / found.name
+    folder = out / found.name if "population" in found.given else out
     options = f"--seed {found.seed} --route {found.route} --format {end}"
     command = f"python -m data_synth make {shlex.quote(path.name)} {options} --out DIR"
-    for name, made in make(found).items():
+    records = make(found)
+    for name, made in records.items():
         files.write_record(folder / f"{name}.{end}", made.time, made.channels)
         truth = {"record": f"{name}.{end}", **made.truth}
         truth["origin"]["command"] = command
         files.write_json(folder / f"{name}.json", truth)
         print(folder / f"{name}.{end}")
+    if found.parts["population"]["people"] is not None:
+        rows = [{"record": f"{name}.{end}", **made.labels} for name, made in records.items()]
+        files.write_table(folder / "study.csv", rows)
+        files.write_json(folder / "truth.json", [list_truth(name, made) for name, made in records.items()])
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 import gzip
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -36,6 +36,12 @@ def file_format(path: Path) -> str:
 def write_json(path: Path, content: Any) -> None:
     """Write indented JSON."""
     text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+    _write_atomically(path, lambda file: file.write(text.encode()))
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, str]]) -> None:
+    """Write rows of text without commas as CSV, below a line with the names of the columns, which all rows share."""
+    text = "".join(",".join(each) + "\n" for each in (rows[0], *(row.values() for row in rows)))
     _write_atomically(path, lambda file: file.write(text.encode()))
 
 

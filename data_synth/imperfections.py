@@ -1,6 +1,6 @@
 """Imperfections of a channel due to instruments and surroundings, in the order in which they act.
 
-Each kind, channel and finger has its own random numbers, so adding one imperfection does not change the others.
+Each kind, channel and record has its own random numbers, so adding one imperfection does not change the others.
 """
 
 import math
@@ -12,7 +12,7 @@ import numpy as np
 from data_synth.recipe import UNITS
 
 # append only: the index seeds the random numbers
-_STREAMS = ("population", "clock", "hum", "pink", "white", "missing", "change")
+_STREAMS = ("population", "clock", "hum", "pink", "white", "missing", "change", "finger", "session", "repetition")
 _CHANNELS = tuple(UNITS)
 _HEADROOM = 1.3  # end of a converter's automatic range over the largest value
 

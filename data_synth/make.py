@@ -1,7 +1,6 @@
 """Records from recipes, by scipy or ngspice, with their true values."""
 
 import functools
-import math
 import platform
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -16,6 +15,7 @@ from data_synth.errors import RecipeError
 from data_synth.friction import friction
 from data_synth.keys import default_value
 from data_synth.network import Network, network, state_space
+from data_synth.population import Touch, draw_touches
 from data_synth.recipe import AS_IT_IS, CIRCUIT_CHANNELS, KEYS, UNITS, Recipe
 from data_synth.scene import KEYS as SCENE
 from data_synth.scene import Scene
@@ -48,46 +48,28 @@ _VALUES = {  # name -> section of the scene, key, unit
 
 
 class Synthetic(NamedTuple):
-    """Record (s, V, V, A, N) with its true values."""
+    """Record (s, V, V, A, N) with its true values, and the labels of its person, finger, session and repetition."""
 
     time: np.ndarray
     channels: dict[str, np.ndarray]
     truth: dict[str, Any]
+    labels: dict[str, str]
 
 
 def make(recipe: Recipe) -> dict[str, Synthetic]:
-    """Return the recipe's records by name: one, or one for each finger of its population.
+    """Return the recipe's records by name: one, or one for each touch of its population.
 
     Raises:
         RecipeError: the route does not support the scene.
     """
-    fingers = recipe.parts["population"]["fingers"]
-    if fingers is None:
-        return {recipe.name: _record(recipe, recipe.scene, 0)}
-    scenes = _population(recipe)
-    return {f"finger{n:02}": _record(recipe, scene, n) for n, scene in enumerate(scenes)}
+    if "population" not in recipe.given:
+        return {recipe.name: _record(recipe, Touch(recipe.name, {}, recipe.scene), 0)}
+    return {touch.name: _record(recipe, touch, n) for n, touch in enumerate(draw_touches(recipe))}
 
 
-def _population(recipe: Recipe) -> list[Scene]:
-    """Return the scene of each finger: log-normal Rsc and Csc, and an area that scales Ci, Csc and 1 / Rsc."""
-    law, scene = recipe.parts["population"], recipe.scene
-    found = []
-    for finger in range(law["fingers"]):
-        first, second, third = imperfections.generator(recipe.seed, finger, "population").standard_normal(3)
-        r, area = law["correlation"], math.exp(law["log_sd_area"] * third)
-        Rsc = scene["skin"]["Rsc"] * math.exp(law["log_sd_Rsc"] * first) / area
-        Csc = scene["skin"]["Csc"] * area
-        Csc *= math.exp(law["log_sd_Csc"] * (r * first + math.sqrt(1.0 - r**2) * second))
-        own = {"skin": {**scene["skin"], "Rsc": Rsc, "Csc": Csc}}
-        own["device"] = {**scene["device"], "Ci": scene["device"]["Ci"] * area}
-        own["device"]["contact_area"] *= area
-        if scene["device"]["Ri"]:
-            own["device"]["Ri"] = scene["device"]["Ri"] / area
-        found.append({**scene, **own})
-    return found
-
-
-def _record(recipe: Recipe, scene: Scene, finger: int) -> Synthetic:
+def _record(recipe: Recipe, touch: Touch, finger: int) -> Synthetic:
+    """Return the record of a touch; the number `finger` selects its random numbers."""
+    scene = touch.scene
     measured, parts = scene["measurement"], _resolve_noise(recipe)
     count = round(measured["duration"] * measured["sampling_rate"])
     if not 2 <= count <= _MOST_SAMPLES:
@@ -122,7 +104,8 @@ def _record(recipe: Recipe, scene: Scene, finger: int) -> Synthetic:
     channels = {n: imperfections.add_imperfections(found[n], n, time, parts, recipe.seed, finger) for n in wanted}
     there = imperfections.sample_mask(count, parts["missing"]["share"], recipe.seed, finger)
     channels = {name: values[there] for name, values in channels.items()}
-    return Synthetic(time[there], channels, _truth(recipe, scene, parts) | _describe_course(course, time[-1]))
+    truth = touch.labels | _truth(recipe, scene, parts) | _describe_course(course, time[-1])
+    return Synthetic(time[there], channels, truth, touch.labels)
 
 
 def _describe_course(course: Course | None, end: float) -> dict[str, Any]:
@@ -223,6 +206,12 @@ def _truth(recipe: Recipe, scene: Scene, parts: dict[str, dict[str, Any]]) -> di
         "recipe": {name: {k: v for k, v in part.items() if v is not None} for name, part in added.items()},
         "origin": {"route": recipe.route, "seed": recipe.seed, "versions": _versions(recipe.route)},
     }
+
+
+def list_truth(name: str, made: Synthetic) -> dict[str, Any]:
+    """Return a record's entry in truth.json: its name, its labels, and its true values in SI units."""
+    values = {key: each["value"] for key, each in made.truth["truth"].items()}
+    return {"name": name, **made.labels, **values}
 
 
 def _versions(route: str) -> dict[str, str]:

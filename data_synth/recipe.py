@@ -16,6 +16,28 @@ AS_IT_IS = "as the scene says"  # skin model of a recipe that states none
 _SUFFIX = ".recipe"
 
 
+class Level(NamedTuple):
+    """Level of a population: its keys in a recipe, the letter of its units in names, and its random numbers.
+
+    number: the key with the number of units. suffix: of the keys log_sd_Rsc, log_sd_Csc and log_sd_area.
+    """
+
+    name: str
+    number: str
+    suffix: str
+    letter: str
+    stream: str
+
+
+LEVELS = (
+    Level("person", "people", "", "P", "population"),
+    Level("finger", "fingers_per_person", "_finger", "F", "finger"),
+    Level("session", "sessions", "_session", "S", "session"),
+    Level("repetition", "repetitions", "_repetition", "r", "repetition"),
+)
+_SDS = ("log_sd_Rsc", "log_sd_Csc", "log_sd_area")
+
+
 def _channel_quantities(low: float = 0.0, default: float | None = None) -> dict[str, Key]:
     """Return a quantity per channel, at least `low`."""
     return {name: Quantity(unit, default, low, least=True) for name, unit in UNITS.items()}
@@ -39,6 +61,9 @@ KEYS: Table = {
         "log_sd_Csc": Quantity("", 0.0, least=True),
         "correlation": Quantity("", 0.0, low=-1.0),
         "log_sd_area": Quantity("", 0.0, least=True),
+        # instead of `fingers`: people, with levels below them; absent: 1, and no variation
+        **{level.number: WholeNumber(None, 1) for level in LEVELS},
+        **{f"{sd}{level.suffix}": Quantity("", least=True) for level in LEVELS[1:] for sd in _SDS},
     },
     # factors of the contact area, of Rsc and of Csc at `time`; random walks in their logarithms, per root of a second
     "change": {
@@ -156,7 +181,20 @@ def _check(parts: dict[str, dict[str, Any]], scene: Scene, given: tuple[str, ...
         raise RecipeError(f"{place}: [stray] has no effect on I in the ground lead; leave it out")
     if parts["shunt"]["V"] == "behind" and not measured["series_resistor"]:
         raise RecipeError(f"{place}: [shunt] V = 'behind' needs a [measurement] series_resistor in the scene; state it")
-    if not -1.0 < parts["population"]["correlation"] < 1.0:
-        raise RecipeError(f"{place}: [population] correlation must lie between -1 and 1")
+    if "population" in given:
+        _check_population(parts["population"], place)
     if parts["missing"]["share"] > 0.9:
         raise RecipeError(f"{place}: [missing] share = {parts['missing']['share']} loses too much; state 0.9 or less")
+
+
+def _check_population(law: dict[str, Any], place: str) -> None:
+    if not -1.0 < law["correlation"] < 1.0:
+        raise RecipeError(f"{place}: [population] correlation must lie between -1 and 1")
+    if law["fingers"] is None and law["people"] is None:
+        raise RecipeError(f"{place}: [population] has neither people nor fingers; state how many there are")
+    if law["fingers"] is not None and law["people"] is not None:
+        raise RecipeError(f"{place}: [population] has people and fingers; write fingers_per_person beside people")
+    below = (key for level in LEVELS[1:] for key in (level.number, *(f"{sd}{level.suffix}" for sd in _SDS)))
+    for key in below:
+        if law["people"] is None and law[key] is not None:
+            raise RecipeError(f"{place}: [population] {key} needs people; write people in place of fingers")

@@ -6,6 +6,7 @@ from .data.readers.read import read
 from .data.readers.spectrum import read_spectra, read_spectrum
 from .data.record import Record
 from .data.spectrum import Spectrum
+from .data.study import Study
 from .design.drive import design_drive
 from .design.drive_design import DriveDesign
 from .design.measurement import MeasurementDesign, design_measurement
@@ -66,6 +67,7 @@ __all__ = [
     "Sine",
     "Spectrum",
     "Square",
+    "Study",
     "Track",
     "Tradeoff",
     "Trapezoid",

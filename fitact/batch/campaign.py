@@ -24,6 +24,7 @@ import jax
 from fitact.batch.fit_many import Fits, Row, failure_row, fit_many, list_sources, read_finger
 from fitact.batch.sample_many import add_posterior, sample_many
 from fitact.compiled import available_cores
+from fitact.data.study import Study
 from fitact.errors import InputError
 from fitact.files import to_json
 from fitact.fitting.fit import fit
@@ -132,7 +133,7 @@ class Journal:
 
 
 def run_campaign(
-    records: Sequence[str | os.PathLike[str] | Sequence[str | os.PathLike[str]]],
+    records: Sequence[str | os.PathLike[str] | Sequence[str | os.PathLike[str]]] | Study,
     folder: str | os.PathLike[str],
     scene: Scene | None = None,
     *,
@@ -155,7 +156,7 @@ def run_campaign(
 
     Args:
         records: paths, which must be accessible to workers on other machines. Paths in a sequence are fitted jointly,
-            as the records of one finger.
+            as the records of one finger. The rows of a `Study` have its labels and covariates, too.
         folder: folder for the results.
         scene: scene of all records.
         channels, scale, rate: channels and sampling rate of the files, as in `fitact.read`.
@@ -168,11 +169,12 @@ def run_campaign(
         progress: whether to report the progress on standard error.
 
     Raises:
-        InputError: a file is named twice, Dask is not installed, the folder cannot be written, or the scheduler
-            cannot be reached.
+        InputError: a file is named twice, Dask is not installed, the folder cannot be written, the scheduler cannot
+            be reached, or a column of the study is also one of the results.
     """
     (scene or Scene()).require_available(fit=True)
-    paths = [_make_absolute(each) for each in records]
+    study = records if isinstance(records, Study) else None
+    paths = [_make_absolute(each) for each in (records.records if isinstance(records, Study) else records)]
     for path, count in Counter(path for each in paths for path in list_sources(each)).most_common(1):
         if count > 1:
             raise InputError(f"{path}: is given twice; give each record once")
@@ -191,7 +193,27 @@ def run_campaign(
             _run_batches(task, batches, journal, scheduler, workers, memory, progress)
     finally:
         journal.close()
-    return Fits(tuple(journal.rows[key] for key in keys))
+    rows = tuple(journal.rows[key] for key in keys)
+    return Fits(rows if study is None else _add_study(rows, study))
+
+
+def _add_study(rows: Sequence[Row], study: Study) -> tuple[Row, ...]:
+    """Return the rows with the labels and covariates of their records after the name.
+
+    Raises:
+        InputError: a covariate has the name of a result.
+    """
+    columns = study.columns
+    for name in columns:
+        if any(name in row for row in rows):
+            raise InputError(
+                f"{study.source}: {name} is also a column of the results; rename it, and run the campaign again, which"
+                " keeps the finished records"
+            )
+    return tuple(
+        {"record": row["record"]} | {name: column[number] for name, column in columns.items()} | row
+        for number, row in enumerate(rows)
+    )
 
 
 def _make_absolute(given: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) -> Paths:

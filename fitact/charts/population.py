@@ -1,16 +1,20 @@
 """Pictures and charts of a population: its fingers, the force on the next finger, and the sources of variance."""
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, TypeAlias
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, PercentFormatter
+from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, NullFormatter, PercentFormatter
 
 from fitact.charts import interactive
-from fitact.charts.figure import ALERT, DATA, MODEL, PRIOR, FigureMaker, log_ticks
+from fitact.charts.figure import ALERT, DATA, GREEN, MODEL, ORANGE, PRIOR, SKY, FigureMaker, log_ticks
 from fitact.charts.interactive import Axis
+from fitact.units import format_percent
+
+Panel: TypeAlias = Callable[[Axes, Any, dict[str, Any]], None]
 
 _NEW_LABEL, _PRIOR_LABEL = "new fingers", "prior"
 NOT_DRAWN_MESSAGE = "Not drawn: some draws are not finite."
@@ -18,13 +22,21 @@ NOT_DRAWN_MESSAGE = "Not drawn: some draws are not finite."
 
 def draw_population(tree: Any, content: dict[str, Any], make: FigureMaker = Figure) -> Figure:
     """Draw the content of population.nc and population.json."""
-    figure = make(figsize=(11.0, 8.4), layout="constrained")
+    panels = choose_panels(content)
+    rows = len(panels) // 2
+    figure = make(figsize=(11.0, 4.2 * rows), layout="constrained")
     if not is_drawable(tree):
         figure.text(0.5, 0.5, NOT_DRAWN_MESSAGE, ha="center")
         return figure
-    for axes, draw in zip(figure.subplots(2, 2).flat, (_draw_skin, _draw_force, _draw_time, _draw_shares), strict=True):
+    for axes, draw in zip(figure.subplots(rows, 2).flat, panels.values(), strict=True):
         draw(axes, tree, content)
     return figure
+
+
+def choose_panels(content: dict[str, Any]) -> dict[str, Panel]:
+    """Return the panels by name; those that compare levels only where there are several."""
+    levels = {"touches": _draw_touches, "levels": _draw_levels} if len(content["levels"]) > 1 else {}
+    return {"skin": _draw_skin, "force": _draw_force} | levels | {"time": _draw_time, "shares": _draw_shares}
 
 
 def is_drawable(tree: Any) -> bool:
@@ -43,11 +55,73 @@ def _draw_skin(axes: Axes, tree: Any, content: dict[str, Any], max_fingers: int 
         for key in ("q025", "q50", "q975")
     )
     widths_Rsc, widths_Csc = np.stack([Rsc - low_Rsc, high_Rsc - Rsc]), np.stack([Csc - low_Csc, high_Csc - Csc])
-    axes.errorbar(Rsc, Csc, widths_Csc, widths_Rsc, fmt="o", ms=4, color=DATA, label="fingers, 95 %")
+    for name, members, color in _group_by_top_level(content):
+        bars = widths_Csc[:, members], widths_Rsc[:, members]
+        axes.errorbar(Rsc[members], Csc[members], *bars, fmt="o", ms=4, color=color, label=name)
     axes.set(xscale="log", yscale="log", xlabel="Rsc", ylabel="Csc", title="Fingers")
     log_ticks(axes.xaxis, "Ω")
     log_ticks(axes.yaxis, "F")
-    axes.legend(markerscale=2, fontsize=9)
+    axes.legend(markerscale=2, fontsize=9, ncols=2)
+
+
+def _group_by_top_level(content: dict[str, Any]) -> Iterator[tuple[str, list[int], Any]]:
+    """Yield the name of each person (or finger) with several records, its records and its colour; or all records."""
+    top = content["levels"][0]["level"]
+    if len(content["levels"]) < 2:
+        yield "fingers, 95 %", list(range(len(content["fingers"]))), DATA
+        return
+    names = [finger["units"][top] for finger in content["fingers"]]
+    unique = list(dict.fromkeys(names))
+    colors = mpl.colormaps["viridis"](np.linspace(0.0, 0.9, len(unique)))
+    few = len(unique) <= 10  # names that a legend has room for
+    for number, (unit, color) in enumerate(zip(unique, colors, strict=True)):
+        label = unit if few else "records, 95 %" if number == 0 else ""
+        yield label, [i for i, name in enumerate(names) if name == unit], color
+
+
+def _draw_touches(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
+    """Draw Rsc and Csc of each record, with 95 % intervals, over their population medians, grouped by person."""
+    position, ticks = 0.0, []
+    for name, members, color in _group_by_top_level(content):
+        places = position + np.arange(len(members))
+        for part, (key, marker, fill) in enumerate((("Rsc", "o", color), ("Csc", "s", "white"))):
+            middle = content["population"][key]["median"]["q50"]
+            found = [content["fingers"][i]["parameters"][key] for i in members]
+            low, values, high = (np.array([each[q] for each in found]) / middle for q in ("q025", "q50", "q975"))
+            axes.errorbar(
+                places + 0.3 * part, values, [values - low, high - values], fmt=marker, ms=5, color=color, mfc=fill,
+                label=key if position == 0.0 else None,
+            )  # fmt: skip
+        ticks.append((float(np.mean(places)) + 0.15, name))
+        position = places[-1] + 2.0
+    axes.axhline(1.0, color=PRIOR, lw=1.0)
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.set_xticks(*zip(*ticks, strict=True), fontsize=9)
+    axes.grid(axis="x", visible=False)
+    axes.set(ylabel="over the population's median", title="Touches")
+    axes.legend(fontsize=9)
+
+
+def _draw_levels(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
+    """Draw the fractions of the variance of each logarithm that come from the levels."""
+    levels = content["levels"]
+    names = list(levels[0]["log_sd"])[::-1]
+    variances = np.array([[level["log_sd"][name]["q50"] ** 2 for name in names] for level in levels])
+    fractions, start = variances / variances.sum(axis=0), np.zeros(len(names))
+    for level, fraction, color in zip(levels, fractions, (MODEL, GREEN, ORANGE, SKY), strict=False):
+        axes.barh(names, fraction, left=start, color=color, label=f"{level['level']} ({level['units']})")
+        for place, (name, x, width) in enumerate(zip(names, start, fraction, strict=True)):
+            if width > 0.12:
+                sd = format_percent(level["log_sd"][name]["q50"])
+                axes.text(x + 0.5 * width, place, sd, ha="center", va="center", color="white", fontsize=9)
+        start = start + fraction
+    axes.set_yticks(range(len(names)), [name.replace("_", " ") for name in names])
+    axes.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+    axes.set(xlim=(0.0, 1.0), xlabel="fraction of the variance; in the bars: standard deviation", title="Levels")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=len(levels), handlelength=1.2, fontsize=9)
 
 
 def _draw_force(axes: Axes, tree: Any, content: dict[str, Any], bins: int = 50) -> None:
@@ -122,11 +196,8 @@ def _draw_shares(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=len(rows) - 1, handlelength=1.2, fontsize=9)
 
 
-PANELS = {"skin": _draw_skin, "force": _draw_force, "time": _draw_time, "shares": _draw_shares}
-
-
-def draw_panel(draw: Callable[[Axes, Any, dict[str, Any]], None], tree: Any, content: dict[str, Any]) -> Figure:
-    """Draw one of `PANELS` as a figure of its own."""
+def draw_panel(draw: Panel, tree: Any, content: dict[str, Any]) -> Figure:
+    """Draw one of `choose_panels` as a figure of its own."""
     figure = Figure(figsize=(9.0, 4.6), layout="constrained")
     axes = figure.add_subplot()
     draw(axes, tree, content)

@@ -7,7 +7,6 @@ from typing import Annotated, Any, Literal
 import typer
 
 import fitact
-from fitact.cli import internal
 from fitact.errors import InputError
 from fitact.files import require_folder
 from fitact.units import parse_quantity
@@ -17,6 +16,23 @@ RecordFiles = Annotated[
     typer.Argument(
         metavar="RECORD...",
         help="CSV with columns time_s, V_V, Vsc_V, I_A, or an oscilloscope file (assign its columns with --channel).",
+    ),
+]
+Table = Annotated[
+    Path | None,
+    typer.Option(
+        "--table",
+        metavar="FILE",
+        help="CSV in place of RECORD: a column 'record' with paths, columns of any of person, finger, session and"
+        " repetition, and a column for each covariate.",
+    ),
+]
+Pattern = Annotated[
+    str | None,
+    typer.Option(
+        "--pattern",
+        metavar="TEXT",
+        help="Where the names of the records state who was measured, e.g. P{person}_r{repetition}.csv.",
     ),
 ]
 _PAPER = "nominal device of the reference paper"
@@ -118,23 +134,20 @@ Results = Annotated[Path, typer.Argument(metavar="DIR", help="Folder with the re
 Fresh = Annotated[bool, typer.Option("--fresh", help="Start a new chain instead of resuming the one in DIR.")]
 
 
-class LazyRecords(Sequence[Any]):
-    """Records and spectra of a scene, each read on access, with the columns and times of --channel, --scale and --rate.
+def load_study(records: Sequence[Path] | None, table: Path | None, pattern: str | None) -> "fitact.Study | None":
+    """Read the table of --table, or names by --pattern; return None if neither is given.
 
-    A folder stands for the track that `fitact track` left there, and so do its files.
+    Raises:
+        InputError: records are missing or given twice, or the table or the names are refused.
     """
-
-    def __init__(self, paths: Sequence[Path] | None, scene: "fitact.Scene | None", columns: Columns) -> None:
-        self._paths, self._scene, self._columns = paths or (), scene, column_options(columns)
-
-    def __len__(self) -> int:
-        return len(self._paths)
-
-    def __getitem__(self, index: Any) -> Any:
-        path = self._paths[index]
-        if path.is_dir() or path.name in ("track.parquet", "summary.json"):
-            return internal.TrackedFinger.from_folder(path)
-        return internal.read_any(path, self._scene, **self._columns)
+    if table is None and not records:
+        raise InputError("no records are given; name files (RECORD...), or a table of them with --table FILE")
+    if table is not None and (records or pattern is not None):
+        extra = f"also given: {records[0]}" if records else f"also given: --pattern {pattern}"
+        raise InputError(f"--table {table}: names and labels all records ({extra}); give one of the two")
+    if table is not None:
+        return fitact.Study.from_table(table)
+    return None if pattern is None else fitact.Study.from_pattern(pattern, records or ())
 
 
 def load_scene(path: Path | str | None) -> "fitact.Scene | None":

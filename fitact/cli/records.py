@@ -10,12 +10,15 @@ from fitact import report
 from fitact.cli import internal, options
 from fitact.cli.app import app
 from fitact.cli.terminal import announce, command_line, show
+from fitact.errors import InputError
 from fitact.files import write_json
 
 
 @app.command()
 def inspect(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Record, impedance spectrum or oscilloscope file.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Record, impedance spectrum, oscilloscope file or table.")
+    ],
     channel: options.Channels = None,
     scale: options.Scales = None,
     rate: options.Rate = None,
@@ -25,7 +28,16 @@ def inspect(
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Plot to write (.svg or .png).")] = None,
     json: options.Json = False,
 ) -> None:
-    """Show the channels, units, sampling rate, noise, clipping and frequency of a file, and list possible problems."""
+    """Show the channels, units, sampling rate, noise, clipping and frequency of a file, and list possible problems.
+
+    Of a table of an experiment (a CSV with a column 'record'), show people, repetitions and covariates.
+    """
+    if internal.is_study(file):
+        if out is not None:
+            raise InputError(f"--out {out}: draws a record, and {file} is a table of records; leave --out away")
+        study = fitact.Study.from_table(file)
+        show(str(study), study.to_dict(), json)
+        return
     if internal.is_spectrum(file):
         spectra = options.read_spectra(file, (spectrum, shunt, band))
         tests = [internal.check_kramers_kronig(each) for each in spectra]
@@ -69,12 +81,14 @@ def compare(
 @app.command()
 def population(
     records: Annotated[
-        list[Path],
+        list[Path] | None,
         typer.Argument(
-            metavar="RECORD...",
+            metavar="RECORD",
             help="Records or spectra on one panel, one per finger, or folders that fitact track left.",
         ),
-    ],
+    ] = None,
+    table: options.Table = None,
+    pattern: options.Pattern = None,
     scene: options.CommonScene = None,
     channel: options.Channels = None,
     scale: options.Scales = None,
@@ -99,13 +113,20 @@ def population(
     With --out, writes report.html, population.json, population.nc (the draws), population.svg and chain.h5 (to resume
     sampling) into DIR.
     """
-    announce("fitting", records)
+    study = options.load_study(records, table, pattern)
+    if table is not None and covariates is not None:
+        raise InputError(f"--covariates {covariates}: {table} has a column for each; add those columns to it")
+    paths = records or () if study is None else study.records
+    announce("fitting", paths)
     loaded = options.load_scene(scene)
-    covariate_values = {} if covariates is None else internal.read_covariates(covariates, records)
+    covariate_values = {} if study is None else dict(study.covariates)
+    if covariates is not None:
+        covariate_values |= internal.read_covariates(covariates, paths)
     if fresh and out is not None:
         internal.delete_chains(out)
     fitted = fitact.population(
-        options.LazyRecords(records, loaded, (channel, scale, rate)), loaded, covariates=covariate_values,
+        internal.RecordFiles(paths, loaded, **options.column_options((channel, scale, rate))), loaded,
+        labels=None if study is None else study.labels, covariates=covariate_values,
         at=options.parse_numbers("--at moisture=0.4", at), folder=out, seed=seed,
     )  # fmt: skip
     content = fitted.to_dict()
@@ -169,10 +190,13 @@ def track(
 
 @app.command()
 def campaign(
-    records: Annotated[
-        list[Path], typer.Argument(metavar="RECORD...", help="Records or spectra, each fitted independently.")
-    ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results, also to resume.")],
+    records: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="RECORD", help="Records or spectra, each fitted independently."),
+    ] = None,
+    table: options.Table = None,
+    pattern: options.Pattern = None,
     scene: options.CommonScene = None,
     channel: options.Channels = None,
     scale: options.Scales = None,
@@ -200,10 +224,11 @@ def campaign(
     Writes results.parquet, failures.csv and index.html into DIR. After an interruption, run the same command again:
     finished records are kept. Exit status 0 means that every record has a result or a reason for its failure.
     """
-    announce("fitting", records)
+    study = options.load_study(records, table, pattern)
+    announce("fitting", records or () if study is None else study.records)
     loaded = options.load_scene(scene)
     fits = fitact.run_campaign(
-        records, out, loaded, **options.column_options((channel, scale, rate)),
+        study or records or (), out, loaded, **options.column_options((channel, scale, rate)),
         scheduler=scheduler, workers=workers, memory=memory, posteriors=posteriors,
         reports=reports, seed=seed,
     )  # fmt: skip

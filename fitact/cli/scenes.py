@@ -1,7 +1,8 @@
 """Commands on a scene: scene, prior, plan, simulate, reproduce, design."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -9,7 +10,19 @@ import fitact
 from fitact import report
 from fitact.cli import internal
 from fitact.cli.app import app
-from fitact.cli.options import Channels, Json, LazyRecords, Out, Rate, Scales, SceneFile, Seed, column_options
+from fitact.cli.options import (
+    Channels,
+    Json,
+    Out,
+    Pattern,
+    Rate,
+    Scales,
+    SceneFile,
+    Seed,
+    Table,
+    column_options,
+    load_study,
+)
 from fitact.cli.terminal import announce, command_line, print_stderr, show
 
 
@@ -150,9 +163,21 @@ def drive(
     ],
     records: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="[RECORD]...", help="One record of each finger; default: the scene's prior is used."),
+        typer.Argument(
+            metavar="[RECORD]...",
+            help="Folder that fitact population left, or one record of each finger; default: the scene's prior is"
+            " used.",
+        ),
     ] = None,
-    share: Annotated[float, typer.Option("--share", help="Fraction of fingers that should feel the drive.")] = 0.95,
+    table: Table = None,
+    pattern: Pattern = None,
+    share: Annotated[
+        float, typer.Option("--share", help="Fraction of fingers or people that should feel the drive.")
+    ] = 0.95,
+    touches: Annotated[
+        float,
+        typer.Option("--touches", help="Fraction of touches in which they should feel it, if records are repeated."),
+    ] = 0.9,
     channel: Channels = None,
     scale: Scales = None,
     rate: Rate = None,
@@ -167,11 +192,19 @@ def drive(
     """
     announce("designing a drive for", [scene])
     stated = fitact.Scene.load(scene)
-    measured = LazyRecords(records, stated, (channel, scale, rate))
-    internal.require_designable(stated, share)  # refuses before the population is sampled
-    people = fitact.population(measured, stated, folder=out, seed=seed) if measured else None
-    options = fitact.design_drive(stated, people, share, seed=seed)
+    internal.require_designable(stated, share, touches)  # refuses before the population is sampled
+    study = None if table is None and pattern is None else load_study(records, table, pattern)
+    paths = records or () if study is None else study.records
+    people: Any = None
+    fingers: Sequence[Any] = ()
+    if study is None and len(paths) == 1 and (paths[0] / "population.json").exists():
+        people = paths[0]
+    elif paths:
+        measured = internal.RecordFiles(paths, stated, **column_options((channel, scale, rate)))
+        labels, covariates = (None, None) if study is None else (study.labels, study.covariates)
+        people = fitact.population(measured, stated, labels=labels, covariates=covariates, folder=out, seed=seed)
+        fingers = people.fingers
+    options = fitact.design_drive(stated, people, share, touches=touches, seed=seed)
     if out is not None:
-        fingers = () if people is None else people.fingers
         report.write_folder(out, options, command_line(), stated, fingers)
     show(str(options), options.to_dict(), json, options.trusted)

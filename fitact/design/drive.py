@@ -6,6 +6,7 @@ finger needs.
 
 import dataclasses
 import functools
+import os
 from typing import NamedTuple
 
 import equinox as eqx
@@ -17,7 +18,7 @@ from jaxtyping import Array, Float
 from fitact.compiled import double_precision, jit
 from fitact.design.drive_design import DriveDesign
 from fitact.design.drive_option import DriveOption, normalize_drive
-from fitact.design.drive_people import FingerSample
+from fitact.design.drive_people import LAWS, FingerSample
 from fitact.errors import InputError
 from fitact.model.circuit import RC
 from fitact.model.drive import Periodic
@@ -25,13 +26,19 @@ from fitact.model.force import Geometry
 from fitact.model.skin import with_values
 from fitact.model.steady_cycle import PeriodQuantities, Sensation, period_quantities, sensation
 from fitact.populations.population import Population
+from fitact.populations.population_draws import PopulationDraws
 from fitact.scene.scene import Scene
 
 WAVEFORMS = ("sine", "triangle", "square", "trapezoid")
 
 
 def design_drive(
-    scene: Scene, people: Population | FingerSample | None = None, share: float = 0.95, *, seed: int = 0
+    scene: Scene,
+    people: Population | FingerSample | str | os.PathLike[str] | None = None,
+    share: float = 0.95,
+    *,
+    touches: float = 0.9,
+    seed: int = 0,
 ) -> DriveDesign:
     """Find the smallest amplitude at which a fraction `share` of fingers feel the drive on the scene's panel.
 
@@ -42,23 +49,28 @@ def design_drive(
 
     Args:
         scene: panel, drive, threshold and, in `[device]`, the limits to keep.
-        people: fingers that are to feel it. A population gives Rsc, Csc and Ci; all else is the scene's. None means
-            the scene's prior, which does not separate variability between fingers from lack of knowledge.
-        share: fraction of fingers, from 0.01 to 0.99.
+        people: fingers that are to feel it. A population, or the folder that `fitact population` left, gives Rsc, Csc
+            and Ci; all else is the scene's. None means the scene's prior, which does not separate variability between
+            fingers from lack of knowledge.
+        share: fraction of fingers, or of people where the population has repetitions, from 0.01 to 0.99.
+        touches: fraction of the touches in which each of them feels it, where the population has repetitions.
         seed: the same seed gives the same fingers.
 
     Raises:
         InputError: the scene states no threshold, or none at a frequency of the force; its drive is measured or has no
-            steady state; its skin depends on the frequency; `share` is out of range.
+            steady state; its skin depends on the frequency; `share` or `touches` is out of range; a folder holds no
+            population.
     """
-    require_designable(scene, share)
+    require_designable(scene, share, touches)
     unloaded = scene.measurement.model_copy(update={"probe_resistance": None, "probe_capacitance": None})
     scene = scene.model_copy(update={"measurement": unloaded})
     if people is None:
         people = FingerSample.from_prior(scene, seed)
     elif isinstance(people, Population):
-        people = dataclasses.replace(FingerSample.from_population(people, scene, seed), warnings=people.warnings)
-    bench, device = _DriveEvaluator(scene, people, share), scene.device
+        people = FingerSample.from_population(PopulationDraws.from_population(people, LAWS), scene, seed)
+    elif not isinstance(people, FingerSample):
+        people = FingerSample.from_population(PopulationDraws.from_folder(people, LAWS), scene, seed)
+    bench, device = _DriveEvaluator(scene, people, share, touches), scene.device
     own, here = scene.drive.waveform, scene.drive.lowest_frequency
     names = [name for name in WAVEFORMS if name != "trapezoid" or scene.drive.rise_time is not None]
     tried = {name: bench.evaluate(name, here) for name in dict.fromkeys([*names, own])}
@@ -75,6 +87,7 @@ def design_drive(
         scene,
         people,
         share,
+        touches if people.touches > 1 else None,
         options={name: option for name, (option, _) in tried.items()},
         needed={name: needed for name, (_, needed) in tried.items()},
         by_frequency={
@@ -96,6 +109,7 @@ class _DriveEvaluator(NamedTuple):
     scene: Scene
     people: FingerSample
     share: float
+    touches: float
 
     def evaluate(
         self, waveform: str, frequency: float, *, thickness: float | None = None, permittivity: float | None = None
@@ -112,7 +126,7 @@ class _DriveEvaluator(NamedTuple):
         assert isinstance(drive, Periodic)
         drive = eqx.tree_at(lambda wave: wave.frequency, drive, frequency)
         quantities, felt = self._unit_quantities(drive, thickness, ratio)
-        needed = _required_amplitudes(self.scene, quantities, felt)
+        needed = self.people.reduce_touches(_required_amplitudes(self.scene, quantities, felt), self.touches)
         return DriveOption.from_amplitudes(waveform, frequency, device, needed, quantities, self.share, felt), needed
 
     def has_room(self, waveform: str, frequency: float) -> bool:
@@ -173,11 +187,13 @@ def _required_amplitudes(
         return np.sqrt(perception.friction_change * scene.friction.normal_force / reachable)
 
 
-def require_designable(scene: Scene, share: float) -> None:
+def require_designable(scene: Scene, share: float, touches: float) -> None:
     """Refuse a scene or share that no drive can be designed for; raises as `design_drive`."""
     perception, drive = scene.perception, scene.drive
     if not 0.01 <= share <= 0.99:  # beyond, the answer is the assumed tail of the distribution
         raise InputError(f"share = {share:g}: give a fraction of fingers from 0.01 to 0.99, such as 0.95")
+    if not 0.01 <= touches <= 0.99:
+        raise InputError(f"touches = {touches:g}: give a fraction of touches from 0.01 to 0.99, such as 0.9")
     if all(each is None for each in (perception.threshold_force, perception.friction_change, perception.thresholds)):
         raise InputError(
             "scene: [perception] must state a threshold, because fitact knows no generally valid one; write"

@@ -34,6 +34,7 @@ class DriveDesign(Display):
         scene: panel, drive and threshold.
         people: fingers that are to feel it.
         share: fraction of them.
+        touches: fraction of the touches in which each of them feels it; None if each has one.
         options: waveforms at the scene's frequency.
         needed: peak-to-peak amplitude (V) at which each finger feels that waveform; infinite if it never does.
         by_frequency: the same waveforms from 10 Hz to 1 kHz.
@@ -44,6 +45,7 @@ class DriveDesign(Display):
     scene: Scene
     people: FingerSample
     share: float
+    touches: float | None
     options: dict[str, DriveOption]
     needed: dict[str, Float[np.ndarray, "laws fingers"]]
     by_frequency: dict[str, tuple[DriveOption, ...]]
@@ -79,6 +81,7 @@ class DriveDesign(Display):
     def recommendation(self) -> str:
         """Sentence that says which amplitude to set, for whom and with which assurance."""
         option, fraction = self.recommended_option, f"{100.0 * self.share:g} %"
+        felt = "feel it" if self.touches is None else f"feel it in {100.0 * self.touches:g} % of touches"
         if not self.trusted:
             return "No amplitude is recommended, because the population is not reliable (its warnings say why)."
         if option is None:
@@ -86,7 +89,7 @@ class DriveDesign(Display):
             return f"No amplitude is recommended, because no waveform meets all conditions ({broken})."
         drive, volts = normalize_drive(self.scene.drive), option.assured
         assurance = (
-            f"with {100.0 * ASSURANCE:g} % probability, at least {fraction} of fingers then feel it"
+            f"with {100.0 * ASSURANCE:g} % probability, at least {fraction} of {self.people.unit} then {felt}"
             if self.people.has_separate_uncertainty
             else f"{fraction} of the fingers drawn from the scene's prior then feel it; no record supports this"
         )
@@ -152,6 +155,7 @@ class DriveDesign(Display):
         return {
             "recommendation": self._recommendation_content(),
             "share": self.share,
+            "touches": self.touches,
             "threshold": self.scene.perception.model_dump(exclude_none=True, exclude={"source"})
             | {
                 "source": self.scene.perception.threshold_source,
@@ -195,7 +199,7 @@ class DriveDesign(Display):
         sentences = []
         if not self.people.trusted:
             sentences.append(
-                "the population fit is not reliable, or most fingers are fitted poorly; see fitact population"
+                "the population fit is not reliable, or most records are fitted poorly; see fitact population"
             )
         sentences += self.people.warnings
         if self.scene.perception.threshold_source is None:
@@ -294,7 +298,9 @@ class DriveDesign(Display):
     @property
     def question(self) -> str:
         """Sentence on who is to feel what."""
-        fingers = f"{100.0 * self.share:g} % of fingers"
+        fingers = f"{100.0 * self.share:g} % of {self.people.unit}"
+        if self.touches is not None:
+            fingers += f" in {100.0 * self.touches:g} % of touches"
         return f"To be felt by {fingers}: {self.threshold}. Fingers: {self.people.source}."
 
     @property

@@ -20,7 +20,7 @@ class ContactAreaTest(NamedTuple):
     """Result of a chi-square test that all fingers have the same Ci, and so the same contact area."""
 
     assumption: str  # `[population] contact_area`, "common" or "varies"
-    fingers: int  # number of fingers whose record determines log Ci better than the prior does
+    fingers: int  # number of records that determines log Ci better than the prior does
     chi_square: float  # of their own log Ci about the weighted mean, with `fingers` - 1 degrees of freedom
     p_value: float  # probability of a larger one if all have the same Ci; NaN for fewer than two such fingers
     log_sd: float  # standard deviation of log Ci between fingers beyond the standard errors (Hedges & Olkin 1985)
@@ -32,13 +32,12 @@ class ContactAreaTest(NamedTuple):
         cls, fingers: Sequence[Finger], prior: Distribution, assumption: str, tolerance: float
     ) -> "ContactAreaTest":
         """Test the fingers whose record determines log Ci better than its `prior`."""
-        informative = [finger for finger in fingers if finger.precision > prior.log_sd**-2]
+        informative = [finger for finger in fingers if finger.log_Ci_precision > prior.log_sd**-2]
         count, nan = len(informative), math.nan
         if count < 2:
             return cls(assumption, count, nan, nan, nan, tolerance)
-        weight = np.array([finger.precision for finger in informative])
-        log_Ci = np.array([finger.center for finger in informative])
-        log_Ci += np.array([finger.weighted_offset for finger in informative]) / weight
+        weight = np.array([finger.log_Ci_precision for finger in informative])
+        log_Ci = np.array([finger.log_Ci for finger in informative])
         mean = np.average(log_Ci, weights=weight)
         chi_square = float(weight @ np.square(log_Ci - mean))
         excess = float(np.var(log_Ci, ddof=1) - np.mean(1.0 / weight))
@@ -68,9 +67,12 @@ class ContactAreaTest(NamedTuple):
         assumed = 'assumed: all fingers have the same contact area ([population] contact_area = "common")'
         if not self.is_tested:
             return f"{assumed}; these records cannot test this, because Vsc alone does not determine a finger's own Ci."
-        scatter = f"the fingers' own Ci differ by {format_percent(self.log_sd)} (1 sd) beyond their standard errors"
+        scatter = f"their own Ci differ by {format_percent(self.log_sd)} (1 sd) beyond their standard errors"
         if self.disagrees:
-            return f'{assumed}; the records disagree: {scatter}; set contact_area = "varies".'
+            return (
+                f'[population] contact_area = "common" is contradicted by the records: {scatter}, which is significant'
+                f' (p = {self.p_value:.2g}); write contact_area = "varies"'
+            )
         return f"{assumed}; the records agree with it: {scatter}."
 
     def to_dict(self) -> dict[str, Any]:

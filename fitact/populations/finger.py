@@ -1,4 +1,4 @@
-"""One finger of a population: the likelihood that is kept of its record after the fit."""
+"""One record of a population: the likelihood that is kept of it after the fit."""
 
 import dataclasses
 import math
@@ -8,13 +8,13 @@ from typing import Self
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy
 from jaxtyping import Array, Float
 
 from fitact import summary
 from fitact.compiled import jit
 from fitact.fitting.result import Fit
 from fitact.likelihood.likelihood import Likelihood
+from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.prior.distributions import LogNormal
 from fitact.prior.prior import Prior
 from fitact.tracking.tracked_finger import TrackedFinger
@@ -25,7 +25,11 @@ SHARED_PARAMETER = "Ci"
 
 @dataclasses.dataclass(frozen=True)
 class Finger:
-    """Fitted record with its likelihood around the optimum, normal in the finger's own coordinates given log Ci."""
+    """Fitted record with its likelihood around the optimum, as a normal one.
+
+    The normal likelihood is exp(-|factor (x - center) - target|^2 / 2), with x the nuisances that belong to the record
+    alone, then log Rsc, log Csc and log Ci.
+    """
 
     source: str  # names of the records
     fingerprint: str  # hash of its numbers
@@ -34,26 +38,22 @@ class Finger:
     parameters: dict[str, summary.Summary]
     # with priors of the nuisances only; without samples if it is compressed; None means that it is normal
     likelihood: Likelihood | None
-    names: tuple[str, ...]  # coordinates of a point; all but Ci are the finger's own
-    center: float  # log Ci of the optimum
-    conditional_mean: Float[np.ndarray, " own"]  # mean of its own coordinates there, given log Ci
-    slope: Float[np.ndarray, " own"]  # derivative of the mean with respect to log Ci
-    covariance_factor: Float[np.ndarray, "own own"]  # root of their covariance
-    precision: float  # inverse variance of log Ci from the record alone
-    weighted_offset: float  # `precision` times (log Ci that the record alone gives, minus `center`)
+    names: tuple[str, ...]  # coordinates of a point of `likelihood`
+    center: Float[np.ndarray, " x"]
+    factor: Float[np.ndarray, "x x"]  # upper triangular
+    target: Float[np.ndarray, " x"]
+    log_sigma: Float[np.ndarray, " sigmas"] = dataclasses.field(default_factory=lambda: np.zeros(0))
+    log_sigma_sd: Float[np.ndarray, " sigmas"] = dataclasses.field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def from_fit(cls, fit: Fit) -> Self:
         """Reduce a fit to its whitened residuals and their Jacobian, and the noise to its Fisher information."""
         likelihood = _flatten_skin_prior(fit.likelihood).without_samples()
-        size, shared = fit.theta.size, fit.names.index(SHARED_PARAMETER)
+        size = fit.theta.size
         theta, log_sigma = np.split(fit.point, [size])
         residuals, jacobian = _linearize(likelihood, theta, np.exp(log_sigma))
-        own = [i for i in range(size) if i != shared]
-        # in R of (own, Ci, residuals), the column of Ci below the own columns holds the record's information on Ci
-        R = np.asarray(np.linalg.qr(np.column_stack([jacobian[:, [*own, shared]], residuals]), mode="r"))
-        n, noise = len(own), np.diag(fit.point_root)[size:]
-        root = np.linalg.inv(R[:n, :n])
+        order = [*_nuisance_places(fit.names), *map(fit.names.index, FINGER_PARAMETERS)]
+        R = np.asarray(np.linalg.qr(np.column_stack([jacobian[:, order], residuals]), mode="r"))
         return cls(
             source=", ".join(os.path.basename(each.source) for each in fit.records),
             fingerprint="-".join(each.fingerprint for each in fit.records),
@@ -61,13 +61,12 @@ class Finger:
             message=fit.message,
             parameters=fit.parameters(),
             likelihood=likelihood,
-            names=fit.point_names,
-            center=float(theta[shared]),
-            conditional_mean=np.append(theta[own] - root @ R[:n, n + 1], log_sigma),
-            slope=np.append(-root @ R[:n, n], np.zeros(noise.size)),
-            covariance_factor=scipy.linalg.block_diag(root, np.diag(noise)),
-            precision=float(R[n, n] ** 2),
-            weighted_offset=float(-R[n, n] * R[n, n + 1]),
+            names=fit.names,
+            center=theta[order],
+            factor=R[:size, :size],
+            target=-R[:size, size],
+            log_sigma=log_sigma,
+            log_sigma_sd=np.diag(fit.point_root)[size:],
         )
 
     @classmethod
@@ -78,7 +77,6 @@ class Finger:
         covariance = np.linalg.inv(R.T @ R + precision)
         log_mean = covariance @ (R.T @ target + precision @ np.asarray(prior.log_mean))
         log_sd = np.sqrt(np.diag(covariance))
-        root, center = np.linalg.inv(R[:2, :2]), float(log_mean[2])
         return cls(
             source=os.path.basename(tracked.source),
             fingerprint=tracked.fingerprint,
@@ -90,12 +88,9 @@ class Finger:
             },
             likelihood=None,
             names=prior.names,
-            center=center,
-            conditional_mean=root @ (target[:2] - R[:2, 2] * center),
-            slope=-root @ R[:2, 2],
-            covariance_factor=root,
-            precision=float(R[2, 2] ** 2),
-            weighted_offset=float(R[2, 2] * (target[2] - R[2, 2] * center)),
+            center=log_mean,
+            factor=R,
+            target=target - R @ log_mean,
         )
 
     def blur(self, within: Float[np.ndarray, "3 3"]) -> Self:
@@ -103,38 +98,68 @@ class Finger:
 
         `within` is that of log Rsc, log Csc and log Ci. The likelihood is taken as normal.
         """
-        own = [name for name in self.names if name != SHARED_PARAMETER]
-        skin = [own.index(name) for name in SKIN]
-        flat = 1e-6  # information of log Ci that stands for none
-        variance = 1.0 / (self.precision + flat)
-        slope = np.append(self.slope[skin], 1.0)
-        whole = variance * np.outer(slope, slope) + within
-        whole[:2, :2] += (self.covariance_factor @ self.covariance_factor.T)[np.ix_(skin, skin)]
-        mean = np.append(self.conditional_mean[skin], self.center) + slope * variance * self.weighted_offset
-        precision = 1.0 / whole[2, 2]
-        along = whole[:2, 2] * precision
+        flat = 1e-6  # information that stands for none
+        R, target = self.skin_factor, self.skin_target
+        covariance = np.linalg.inv(R.T @ R + flat * np.eye(3))
+        factor = np.linalg.cholesky(np.linalg.inv(covariance + within)).T
         return dataclasses.replace(
             self,
             likelihood=None,
-            names=(*SKIN, SHARED_PARAMETER),
-            conditional_mean=mean[:2] + along * (self.center - mean[2]),
-            slope=along,
-            covariance_factor=np.linalg.cholesky(whole[:2, :2] - np.outer(along, whole[:2, 2])),
-            precision=max(precision - flat, 0.0),
-            weighted_offset=precision * (mean[2] - self.center),
+            names=FINGER_PARAMETERS,
+            center=self.center[-3:],
+            factor=factor,
+            target=factor @ covariance @ R.T @ target,
+            log_sigma=np.zeros(0),
+            log_sigma_sd=np.zeros(0),
         )
 
-    def from_standard_normal(
-        self, log_Ci: float, z: Float[np.ndarray, "draws own"]
-    ) -> Float[np.ndarray, "draws coordinates"]:
-        own = self.conditional_mean + self.slope * (log_Ci - self.center) + z @ self.covariance_factor.T
-        return np.insert(own, self.names.index(SHARED_PARAMETER), log_Ci, axis=1)
+    @property
+    def skin_factor(self) -> Float[np.ndarray, "3 3"]:
+        """`factor` of log Rsc, log Csc and log Ci, after all nuisances."""
+        return self.factor[-3:, -3:]
+
+    @property
+    def skin_target(self) -> Float[np.ndarray, " 3"]:
+        return self.target[-3:]
+
+    @property
+    def log_Ci_precision(self) -> float:
+        """Inverse variance of log Ci from the record alone."""
+        return float(self.factor[-1, -1] ** 2)
+
+    @property
+    def log_Ci(self) -> float:
+        """Log Ci from the record alone."""
+        return float(self.center[-1] + self.target[-1] / self.factor[-1, -1])
+
+    def place_nuisances(
+        self, logs: Float[np.ndarray, "draws 3"], z: Float[np.ndarray, "draws nuisances"]
+    ) -> tuple[Float[np.ndarray, "draws coordinates"], Float[np.ndarray, " draws"]]:
+        """Return points of `likelihood`, with nuisances that standard normal `z` draw given log Rsc, Csc and Ci.
+
+        Also returns the logarithm of the normal likelihood of `logs` times the density of the nuisances.
+        """
+        own = self.target.size - 3
+        away = logs - self.center[-3:]
+        nuisances = np.linalg.solve(
+            self.factor[:own, :own], (self.target[:own] - away @ self.factor[:own, own:].T + z[:, :own]).T
+        ).T
+        points = np.empty((len(logs), len(self.names) + self.log_sigma.size))
+        points[:, _nuisance_places(self.names)] = self.center[:own] + nuisances
+        points[:, list(map(self.names.index, FINGER_PARAMETERS))] = logs
+        points[:, len(self.names) :] = self.log_sigma + self.log_sigma_sd * z[:, own:]
+        misfit = np.sum(np.square(away @ self.skin_factor.T - self.skin_target), axis=1)
+        return points, -0.5 * (misfit + np.sum(np.square(z), axis=1))
+
+
+def _nuisance_places(names: tuple[str, ...]) -> list[int]:
+    return [i for i, name in enumerate(names) if name not in FINGER_PARAMETERS]
 
 
 def _flatten_skin_prior(likelihood: Likelihood, log_sd: float = 1e3) -> Likelihood:
     """Replace the priors of Rsc, Csc and Ci by uninformative ones."""
     prior = likelihood.prior
-    flat = {name: LogNormal(math.exp(prior[name].log_mean), log_sd) for name in (*SKIN, SHARED_PARAMETER)}
+    flat = {name: LogNormal(math.exp(prior[name].log_mean), log_sd) for name in FINGER_PARAMETERS}
     marginals = dict(zip(prior.names, prior.marginals, strict=True)) | flat
     return dataclasses.replace(likelihood, prior=Prior.of(**marginals))
 

@@ -1,29 +1,31 @@
 """Fit of a population: its parameters are sampled from records of several fingers."""
 
-import functools
 import hashlib
 import importlib.metadata
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from jaxtyping import Float
 
 from fitact.compiled import BatchEvaluator, double_precision
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
+from fitact.data.study import Nesting, Study, nest_levels
 from fitact.errors import InputError
 from fitact.fitting.fit import fit
 from fitact.fitting.result import Fit
+from fitact.populations.contact_area import ContactAreaTest
 from fitact.populations.covariates import Covariates
+from fitact.populations.exact_likelihood import correct_draws
 from fitact.populations.finger import SHARED_PARAMETER, SKIN, Finger
-from fitact.populations.finger_likelihoods import FingerLikelihoods
-from fitact.populations.hierarchy import Hierarchy, laplace
-from fitact.populations.next_finger import AREA, NewFingerModel
-from fitact.populations.population import MAX_INTEGRATION_ERROR, Population, evaluate_parameters, log_medians
+from fitact.populations.hierarchy import AREA, Hierarchy, laplace
+from fitact.populations.next_finger import NewFingerModel
+from fitact.populations.population import Population, evaluate_parameters, log_medians
+from fitact.populations.record_files import RecordFiles
 from fitact.populations.within_finger import WithinFinger
 from fitact.prior.prior import Prior
 from fitact.progress import track_progress
@@ -35,18 +37,17 @@ from fitact.scene.sections import DriveSection
 from fitact.tracking.track import Track
 from fitact.tracking.tracked_finger import TrackedFinger
 
-# by the number of draws in the fingers' tables; the second is used where the first is too coarse
-_CHAIN_FILES = {64: "chain.h5", 1024: "chain_1024.h5"}
-
+_CHAIN_FILE = "chain.h5"
 
 # what is given of one finger: a track, or what `fit` takes
 FingerData: TypeAlias = Record | Spectrum | Sequence[Record | Spectrum] | Track | TrackedFinger
 
 
 def population(
-    records: Sequence[FingerData],
+    records: Sequence[FingerData] | Study,
     scene: Scene | None = None,
     *,
+    labels: Mapping[str, Sequence[str]] | None = None,
     covariates: Mapping[str, Sequence[float]] | None = None,
     at: Mapping[str, float] | None = None,
     folder: str | os.PathLike[str] | None = None,
@@ -54,20 +55,24 @@ def population(
     max_steps: int = 20_000,
     progress: bool = True,
 ) -> Population:
-    """Sample the distribution of fingers on one panel, from one record of each finger, until converged.
+    """Sample the distribution of fingers on one panel, from records of persons, fingers and touches, until converged.
 
-    Rsc and Csc are log-normal over fingers, with a correlation. All fingers share the panel's Ci. With the scene's
-    `[population] contact_area = "varies"`, Ci, Csc and 1/Rsc scale with each finger's own log-normal contact area.
-    Medians and Ci have the scene's prior, log-standard deviations a half-normal prior of scale 0.5, and the correlation
-    r has the density 3/4 (1 - r^2). Each finger's own parameters are integrated out.
+    log Rsc and log Csc of a touch are the sum of medians and of normal effects of its person, finger, session and
+    repetition, as far as `labels` tell these apart; without labels each record is another finger. At each level Rsc and
+    Csc are correlated. All share the panel's Ci. With the scene's `[population] contact_area = "varies"`, Ci, Csc and
+    1/Rsc scale with each touch's own log-normal contact area, which has effects at the same levels. Medians and Ci have
+    the scene's prior, log-standard deviations a half-normal prior of scale 0.5, and a correlation r has the density 3/4
+    (1 - r^2). The effects are integrated out.
 
     Args:
-        records: one record, spectrum or track of each finger, on one panel, or a sequence of records that are fitted
-            jointly; they are read one after the other and not kept. A finger of a track is its average over time; the
-            tracks together give the variation within fingers.
+        records: records, spectra or tracks on one panel, or sequences of records that are fitted jointly; they are read
+            one after the other and not kept. A finger of a track is its average over time; the tracks together give
+            the variation within fingers. A `Study` has labels and covariates, too.
         scene: scene of all records; its prior of Rsc and Csc is the prior of their medians.
-        covariates: one number per finger under each name, such as skin moisture; the medians of log Rsc and log Csc
-            change linearly with each, with a normal prior of scale 0.5 per standard deviation of the covariate.
+        labels: one text per record under each of "person", "finger", "session" and "repetition" that is known.
+        covariates: one number per record under each name, such as skin moisture; the medians of log Rsc and log Csc,
+            and of the area if it varies, change linearly with each, with a normal prior of scale 0.5 per standard
+            deviation of the covariate.
         at: covariates of the next finger; default: their mean.
         folder: folder for the chain; a chain of the same records there is resumed.
         seed: the same seed gives the same draws, whether or not sampling was interrupted.
@@ -78,7 +83,8 @@ def population(
 
     Raises:
         InputError: there are fewer than two records, one is given twice or refused, the scene's prior does not leave
-            Rsc, Csc and Ci free, a covariate has no effect to estimate, or the folder's chain has other inputs.
+            Rsc, Csc and Ci free, the records contradict one contact area, two records have the same labels, a covariate
+            has no effect to estimate, or the folder's chain has other inputs.
     """
     scene = scene or Scene()
     medians = _prior(scene)
@@ -88,43 +94,45 @@ def population(
             "scene: [population] contact_area = 'varies' excludes a leak of the insulator, whose Ri would vary, too;"
             " leave [device] Ri and [prior] Ri out, or state contact_area = 'common'"
         )
-    standardized = Covariates.from_values(covariates or {}, len(records))
+    if isinstance(records, Study):
+        labels = labels or records.labels
+        covariates = covariates or records.covariates
+        items: Sequence[FingerData] = RecordFiles(records.records, scene)
+    else:
+        items = records
+    nesting = nest_levels(labels or {}, len(items))
+    standardized = Covariates.from_values(covariates or {}, len(items))
     next_at = standardized.standardize(at or {})
     factors = (*SKIN, SHARED_PARAMETER, *((AREA,) if area_varies else ()), *scene.thickness_sd())
     # errors of the instruments are the same for all fingers, so that they do not make these differ
     exact = scene.without_instrument_errors()
-    fingers, new_finger, tracked = _fit_fingers(records, exact, medians, factors, progress)
+    fingers, new_finger, tracked = _fit_fingers(items, exact, medians, factors, progress)
+    area_test = ContactAreaTest.from_fingers(
+        fingers, medians[SHARED_PARAMETER], scene.population.contact_area, math.log1p(scene.tolerance.force)
+    )
+    if area_test.disagrees:
+        raise InputError(f"scene: {area_test.sentence}")
     within = _pool_tracks(fingers, tracked, new_finger, seed)
     averages = [
         finger if within is None or finger.fingerprint in tracked else finger.blur(within.mean_covariance)
         for finger in fingers
     ]
-    make_tables = functools.partial(
-        FingerLikelihoods.from_fingers, averages, medians[SHARED_PARAMETER], area_varies=area_varies
-    )
     with double_precision():
-
-        def hierarchy(draws: int, terms: int, purpose: int) -> Hierarchy:
-            tables = make_tables(draws=draws, terms=terms, seed=[seed, purpose])
-            return Hierarchy(tables, medians, area_varies, standardized.z_scores)
-
-        for draws, name in _CHAIN_FILES.items():
-            sampled = hierarchy(draws, terms=9, purpose=2)
-            chain_file = None if folder is None else Path(folder) / name
-            fingerprint = _fingerprint(averages, standardized, scene, seed, draws)
-            points, convergence = _sample_hierarchy(sampled, fingerprint, seed, max_steps, chain_file, progress)
-            error = _integration_error(sampled, hierarchy(max(draws, 256), terms=13, purpose=3), points)
-            if error <= MAX_INTEGRATION_ERROR or not convergence.converged:
-                break
+        hierarchy = Hierarchy.from_fingers(averages, nesting, medians, standardized.z_scores, area_varies=area_varies)
+        chain_file = None if folder is None else Path(folder) / _CHAIN_FILE
+        fingerprint = _fingerprint(averages, nesting, standardized, scene, seed)
+        points, convergence = _sample_hierarchy(hierarchy, fingerprint, seed, max_steps, chain_file, progress)
+        top = nesting.levels[0].unit_numbers
+        points, error = correct_draws(hierarchy, averages, top, points, seed, progress)
     return Population(
-        fingers, sampled, points, convergence, error, new_finger, standardized, next_at, scene, seed, within
-    )
+        fingers, nesting, hierarchy, points, convergence, error, new_finger, standardized, next_at, scene, seed,
+        area_test, within,
+    )  # fmt: skip
 
 
 def delete_chains(folder: str | os.PathLike[str]) -> None:
-    """Remove the chains of `population` from a folder."""
-    for name in _CHAIN_FILES.values():
-        (Path(folder) / name).unlink(missing_ok=True)
+    """Remove the chain of `population` from a folder."""
+    (Path(folder) / _CHAIN_FILE).unlink(missing_ok=True)
 
 
 def _sample_hierarchy(
@@ -132,7 +140,7 @@ def _sample_hierarchy(
 ) -> tuple[np.ndarray, Convergence]:
     """Sample points (ensembles, about `draws`, coordinates), with their diagnostics."""
     walkers, ensembles, draws = 128, 4, 2500
-    rows = hierarchy.fingers.weight.size
+    rows = hierarchy.targets.size * hierarchy.origin.size
     log_prob = reject_nonfinite(BatchEvaluator(Hierarchy.log_prob, hierarchy, rows, walkers // 2))
     target = Target(
         hierarchy.names,
@@ -168,7 +176,7 @@ def _fit_fingers(
 ) -> tuple[tuple[Finger, ...], NewFingerModel, dict[str, TrackedFinger]]:
     """Fit each record by itself, and model the next finger under the first record's drive; also return the tracks."""
     if len(records) < 2:
-        raise InputError(f"{len(records)} records: a population needs one record of each of two or more fingers")
+        raise InputError(f"{len(records)} records: a population needs records of two or more fingers or touches")
     fingers: dict[str, Finger] = {}
     tracks: dict[str, TrackedFinger] = {}
     refusals: list[InputError] = []
@@ -228,23 +236,9 @@ def _refusal(errors: Sequence[InputError], max_named: int = 5) -> InputError:
     return InputError(f"{errors[0]}; also refused: {', '.join(names)}" if names else str(errors[0]))
 
 
-def _integration_error(
-    hierarchy: Hierarchy, finer: Hierarchy, points: Float[np.ndarray, "ensembles draws n"], count: int = 500
-) -> float:
-    """Estimate the largest shift of any mean with finer tables, in standard deviations, from `count` points.
-
-    To first order, a mean shifts by its covariance with the change of the log-posterior.
-    """
-    flat = points.reshape(-1, points.shape[-1])
-    flat = flat[np.linspace(0, len(flat) - 1, count).astype(int)]
-    coarse, fine = (
-        BatchEvaluator(Hierarchy.log_prob, tables, tables.fingers.weight.size)(flat) for tables in (hierarchy, finer)
-    )
-    return float(np.std(fine - coarse))
-
-
-def _fingerprint(fingers: Sequence[Finger], covariates: Covariates, scene: Scene, seed: int, draws: int) -> str:
+def _fingerprint(fingers: Sequence[Finger], nesting: Nesting, covariates: Covariates, scene: Scene, seed: int) -> str:
     """Return a hash of all inputs of a chain."""
-    data = [[finger.fingerprint, finger.center, finger.conditional_mean.tolist()] for finger in fingers]
-    settings = [importlib.metadata.version("fitact"), data, covariates.z_scores.tolist(), scene.to_json(), seed, draws]
+    data = [[finger.fingerprint, finger.center.tolist(), finger.target.tolist()] for finger in fingers]
+    units = [[level.name, level.unit_numbers.tolist()] for level in nesting.levels]
+    settings = [importlib.metadata.version("fitact"), data, units, covariates.z_scores.tolist(), scene.to_json(), seed]
     return hashlib.sha256(json.dumps(settings).encode()).hexdigest()

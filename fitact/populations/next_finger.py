@@ -14,10 +14,9 @@ from fitact.fitting import derived
 from fitact.fitting.result import Fit
 from fitact.model.drive import Periodic, Sampled
 from fitact.populations.finger import SHARED_PARAMETER, SKIN
-from fitact.populations.finger_likelihoods import PopulationParameters
+from fitact.populations.hierarchy import AREA
 from fitact.problem.drive_choice import whole_periods
 
-AREA = "contact_area"
 THICKNESSES = ("skin_thickness", "insulator_thickness")
 FACTORS = (*SKIN, SHARED_PARAMETER, AREA, *THICKNESSES)  # the first three are at the median area and thickness
 FRICTION = ("mu", "fN", "force_scale")  # parameters of a measured friction on which the computed one depends
@@ -108,6 +107,15 @@ class NewFingerModel(eqx.Module):
         evaluator = BatchEvaluator(NewFingerModel.__call__, model, model.derive.time.size, batch=512)
         return evaluator.map_over(factors.shape[:-1], factors)
 
+    def log_gradients(
+        self, factors: Float[np.ndarray, "points factors"], step: float = 1e-3
+    ) -> dict[str, Float[np.ndarray, "points factors"]]:
+        """Return the derivatives of the logarithms of the quantities in the factors."""
+        ends = step * np.concatenate([np.eye(len(self.factors)), -np.eye(len(self.factors))])
+        with np.errstate(divide="ignore", invalid="ignore"):  # an amplitude may be 0
+            upper, lower = np.split(np.log(self.evaluate(factors[:, None] + ends)), 2, axis=1)
+            return dict(zip(self.names, np.moveaxis(upper - lower, -1, 0) / (2.0 * step), strict=True))
+
     def _tabulate(self, factors: Float[np.ndarray, "*shape factors"]) -> Self:
         points = self._theta(factors).reshape(-1, self.theta.size)
         return dataclasses.replace(self, derive=self.derive.tabulate(points))
@@ -139,35 +147,17 @@ def finger_variance_fraction(values: Float[np.ndarray, "laws fingers"]) -> float
     return fingers / (fingers + max(parameters, 0.0))
 
 
-def intrafinger_variance_fraction(moments: Float[np.ndarray, "2 laws fingers"]) -> float:
-    """Return the variance within fingers over that of all fingers of the same population parameters, from two moments.
+def redrawn_variance_fraction(pairs: Float[np.ndarray, "2 laws fingers"]) -> float:
+    """Return the variance of what differs between the members of pairs, over that of all with the same parameters.
 
-    Half the mean square of the difference of two moments of a finger is the variance within it.
+    Half the mean square of the difference of two touches of a finger is the variance within it.
     """
-    whole = float(np.mean(np.var(moments, axis=2, ddof=1)))
-    return min(0.5 * float(np.mean(np.square(moments[1] - moments[0]))) / whole, 1.0)
+    whole = float(np.mean(np.var(pairs, axis=2, ddof=1)))
+    return min(0.5 * float(np.mean(np.square(pairs[1] - pairs[0]))) / whole, 1.0)
 
 
-def draw_factors(
-    parameters: PopulationParameters, thickness_sd: dict[str, float], fingers: int, random: np.random.Generator
-) -> Float[np.ndarray, "laws fingers factors"]:
-    """Draw logarithms of the factors of `fingers` fingers for each population sample; leaves of these are (laws, 1).
-
-    `thickness_sd` has the log-standard deviation of each of `THICKNESSES` that is a factor.
-    """
-    z = random.standard_normal((len(parameters.median), fingers, 3))
-    thicknesses = [sd * random.standard_normal((*z.shape[:2], 1)) for sd in thickness_sd.values()]
-    return np.concatenate([factors_from_normal(parameters, z), *thicknesses], axis=-1)
-
-
-def factors_from_normal(
-    parameters: PopulationParameters, z: Float[np.ndarray, "laws fingers 3"]
-) -> Float[np.ndarray, "laws fingers factors"]:
-    """Turn standard normal numbers into logarithms of Rsc, Csc, Ci and, if it varies, contact area."""
-    r = parameters.correlation
-    second = r * z[..., 0] + np.sqrt(1.0 - r**2) * z[..., 1]
-    skin = parameters.median + parameters.log_sd * np.stack([z[..., 0], second], axis=-1)
-    factors = [skin[..., 0], skin[..., 1], np.broadcast_to(parameters.log_Ci, second.shape)]
-    if parameters.area is not None:
-        factors.append(parameters.area * z[..., 2])
-    return np.stack(factors, axis=-1)
+def draw_thicknesses(
+    log_sds: dict[str, float], shape: tuple[int, ...], random: np.random.Generator
+) -> Float[np.ndarray, "*shape thicknesses"]:
+    """Draw logarithms of thicknesses with the log-standard deviation of each of `THICKNESSES` that is a factor."""
+    return np.array(list(log_sds.values())) * random.standard_normal((*shape, len(log_sds)))

@@ -5,7 +5,7 @@ import functools
 import importlib.metadata
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -13,21 +13,23 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitact import charts, summary
-from fitact.compiled import jit
+from fitact.compiled import BatchEvaluator, jit
+from fitact.data.study import Nesting
 from fitact.files import atomic_write
 from fitact.populations.contact_area import ContactAreaTest
 from fitact.populations.covariates import Covariates
+from fitact.populations.exact_likelihood import MAX_INTEGRATION_ERROR
 from fitact.populations.finger import SHARED_PARAMETER, SKIN, Finger
-from fitact.populations.finger_likelihoods import PopulationParameters
-from fitact.populations.hierarchy import Hierarchy
+from fitact.populations.hierarchy import AREA, Hierarchy
 from fitact.populations.next_finger import (
-    AREA,
     NAMES,
     NewFingerModel,
-    draw_factors,
+    draw_thicknesses,
     finger_variance_fraction,
-    intrafinger_variance_fraction,
+    redrawn_variance_fraction,
 )
+from fitact.populations.population_parameters import PopulationParameters
+from fitact.populations.repeatability import LevelVariances
 from fitact.populations.sobol import SobolIndices, variance_shares
 from fitact.populations.within_finger import WithinFinger
 from fitact.sampling.convergence import Convergence
@@ -37,9 +39,14 @@ from fitact.tables import Display, align_table, join_lines, to_dataframe, to_dat
 from fitact.units import choose_prefixed_unit, format_engineering, format_percent, quantity_unit
 
 QUANTILES = tuple(summary.PROBABILITIES.values())  # of the force in time
-MAX_INTEGRATION_ERROR = 0.1  # largest shift of a mean by the fingers' tables, in posterior standard deviations
 VARIANCE_QUANTITIES = ("force_mean", "force_peak")  # quantities with Sobol indices
 ADVICE = "use track"  # in the message of a fit that shows a finger that changes
+UNIT_NAMES = {  # of levels, one and several
+    "person": ("person", "people"),
+    "finger": ("finger", "fingers"),
+    "session": ("session", "sessions"),
+    "repetition": ("touch", "touches"),
+}
 SHARES_LEGEND = "Parameters: Sobol indices, first-order (total)."
 
 
@@ -49,20 +56,23 @@ class Population(Display):
 
     Attributes:
         fingers: fit of each record by itself.
+        nesting: person, finger, session and repetition of each record, as far as these are levels.
         hierarchy: posterior of the population parameters.
         points: draws in the coordinates of `hierarchy`.
         convergence: diagnostics of these draws.
-        off: largest shift of a mean by the integrals over the fingers, in posterior standard deviations.
+        off: largest shift of a mean by the error of the records' likelihoods, in posterior standard deviations.
         finger: model of the next finger, under the first record's drive.
         covariates: covariates of the fingers; may be empty.
         at: covariates of the next finger, in standard deviations from the mean.
         scene: scene of all records.
         seed: seed of all random numbers.
+        contact_area: test of the assumption that all have the same contact area.
         within: variation within tracked fingers; None means that none was tracked.
         laws, fingers_per_law: number of population samples for new fingers, and of new fingers for each.
     """
 
     fingers: tuple[Finger, ...]
+    nesting: Nesting
     hierarchy: Hierarchy
     points: Float[np.ndarray, "ensembles draws n"]
     convergence: Convergence
@@ -72,6 +82,7 @@ class Population(Display):
     at: Float[np.ndarray, " covariates"]
     scene: Scene
     seed: int
+    contact_area: ContactAreaTest
     within: WithinFinger | None = None
     laws: int = 1000
     fingers_per_law: int = 32
@@ -93,16 +104,14 @@ class Population(Display):
             sentences.append(self.convergence.warning)
         if not self.off <= MAX_INTEGRATION_ERROR:
             sentences.append(
-                f"the integrals over the fingers may shift means by {self.off:.2g} standard deviations; leave out the"
-                " records that constrain Rsc and Csc least"
+                "the records' likelihoods are too far from normal for a population (means may shift by"
+                f" {self.off:.2g} standard deviations); leave out the records that constrain Rsc and Csc least"
             )
         if self.hierarchy.area_varies and not self.contact_area.is_tested:
             sentences.append(
                 "these records do not determine the contact area, so its standard deviation is the prior's; record I,"
                 " too, or an impedance"
             )
-        if self.contact_area.disagrees:
-            sentences.append(self.contact_area.sentence)
         return tuple(sentences)
 
     @property
@@ -117,8 +126,9 @@ class Population(Display):
             else f"the uncertainty of that law and of {thickness}"
         )
         sentences = [
+            *self.nesting.omitted,
             f"the force is computed with [force] model = '{self.scene.force.model}', not measured; its intervals"
-            f" exclude {excluded}"
+            f" exclude {excluded}",
         ]
         if "friction" not in self.scene.model_fields_set:
             friction = self.scene.friction
@@ -134,31 +144,50 @@ class Population(Display):
             )
         if self.within is not None:
             sentences += self.within.describe_assumptions(len(self.fingers))
-        area = self.contact_area
-        return tuple(sentences) if area.disagrees else (*sentences, area.sentence)
+        return (*sentences, *self._prior_sentences, self.contact_area.sentence)
 
-    @functools.cached_property
-    def contact_area(self) -> ContactAreaTest:
-        """Test of the assumption that all fingers have the same contact area."""
-        prior, scene = self.hierarchy.prior[SHARED_PARAMETER], self.scene
-        return ContactAreaTest.from_fingers(
-            self.fingers, prior, scene.population.contact_area, math.log1p(scene.tolerance.force)
-        )
+    @property
+    def _prior_sentences(self) -> Iterator[str]:
+        """Sentences on spreads between few units that depend on their prior."""
+        names, relevant = self.hierarchy.components, 0.3  # of the standard deviation
+        for place, level in enumerate(self.nesting.levels):
+            for component, name in enumerate(names):
+                found = self._parameter_draws.log_sd[..., place, component]
+                low, high = (self._median_with_prior_scale(place, component, scale) for scale in (0.5, 2.0))
+                if high - low > relevant * float(np.std(found)):
+                    units = f"{len(level.units)} {UNIT_NAMES[level.name][1]}"
+                    yield (
+                        f"with only {units}, the spread of {_quantity(name)} between them depends on its prior: its"
+                        f" median is {low:.2g} to {high:.2g} with half to twice the scale"
+                    )
+
+    def _median_with_prior_scale(self, level: int, component: int, scale: float) -> float:
+        """Return the median of a log-standard deviation if its prior had `scale` times the scale."""
+        draws = self._parameter_draws.log_sd[..., level, component].ravel()
+        z = draws / self.hierarchy.log_sd_scale
+        weights = np.exp(0.5 * np.square(z) - 0.5 * np.square(z / scale))
+        order = np.argsort(draws)
+        total = np.cumsum(weights[order])
+        return float(draws[order][np.searchsorted(total, 0.5 * total[-1])])
 
     def parameters(self) -> dict[str, Float[np.ndarray, "ensembles draws"]]:
         """Return draws of the population parameters.
 
-        These are the medians of Rsc (ohm) and Csc (F), Ci (F), log-standard deviations and correlation. With covariates
-        also slopes: change of log Rsc and log Csc per unit of each covariate.
+        These are the medians of Rsc (ohm) and Csc (F), Ci (F), log-standard deviations and correlations; those of the
+        levels below the top have the level at the end of their name. With covariates also slopes: change of log Rsc
+        and log Csc per unit of each covariate.
         """
         law = self._parameter_draws
-        draws = {f"log_sd_{name}": law.log_sd[..., i] for i, name in enumerate(SKIN)}
-        draws |= {} if law.area is None else {"log_sd_area": law.area}
-        if law.slopes is not None:
-            per_unit = law.slopes / self.covariates.sd[:, None]
-            for i, name in enumerate(self.covariates.names):
-                draws |= {f"slope_{skin}_{name}": per_unit[..., i, j] for j, skin in enumerate(SKIN)}
-        return draws | {"correlation": law.correlation} | {k: np.exp(x) for k, x in log_medians(law).items()}
+        draws: dict[str, np.ndarray] = {}
+        components = [*SKIN, "area"][: law.mean.shape[-1]]
+        endings = ["", *(f"_{level.name}" for level in self.nesting.levels[1:])]
+        for place, ending in enumerate(endings):
+            draws |= {f"log_sd_{name}{ending}": law.log_sd[..., place, i] for i, name in enumerate(components)}
+        per_unit = law.slopes / self.covariates.sd[:, None]
+        for i, name in enumerate(self.covariates.names):
+            draws |= {f"slope_{each}_{name}": per_unit[..., i, j] for j, each in enumerate(components)}
+        draws |= {f"correlation{ending}": law.correlation[..., place] for place, ending in enumerate(endings)}
+        return draws | {k: np.exp(x) for k, x in log_medians(law).items()}
 
     @functools.cached_property
     def _parameter_draws(self) -> PopulationParameters:
@@ -174,27 +203,83 @@ class Population(Display):
         return self._moments[0]
 
     @functools.cached_property
-    def _moments(self) -> Float[np.ndarray, "moments laws fingers factors"]:
-        """Factors of new fingers at one moment, and of the same fingers at another one if fingers were tracked."""
-        random = np.random.default_rng([self.seed, 1])
-        factors = self._draw_factors(random, draw_parameters(self, self.laws))
-        if self.within is None:
-            return factors[None]
-        moments = np.stack([factors, factors])
-        moments[..., :3] += self.within.draw_deviations(moments.shape[:3], random)
-        return moments
+    def _moments(self) -> Float[np.ndarray, "touches laws fingers factors"]:
+        """Factors of a touch of new fingers, and of others that share ever fewer levels with it.
+
+        The second is another moment of the same touch if fingers were tracked.
+        """
+        random, levels = np.random.default_rng([self.seed, 1]), len(self.nesting.levels)
+        shared = [levels, *([] if self.within is None else [levels]), *range(levels - 1, 0, -1)]
+        law = draw_parameters(self, self.laws)
+        deviates = random.standard_normal(
+            (len(shared), self.laws, self.fingers_per_law, levels, len(self.hierarchy.components))
+        )
+        for touch, count in zip(deviates, shared, strict=True):
+            touch[..., :count, :] = deviates[0, ..., :count, :]
+        factors = self._add_thicknesses(law.make_factors(deviates), random)
+        if self.within is not None:
+            factors[..., :3] += self.within.draw_deviations(factors.shape[:3], random)
+        return factors
+
+    def _add_thicknesses(
+        self, factors: Float[np.ndarray, "*touches laws fingers factors"], random: np.random.Generator
+    ) -> Float[np.ndarray, "*touches laws fingers all_factors"]:
+        """Append the thicknesses of fingers, which all their touches share."""
+        thicknesses = draw_thicknesses(self.scene.thickness_sd(), factors.shape[-3:-1], random)
+        thicknesses = np.broadcast_to(thicknesses, (*factors.shape[:-1], thicknesses.shape[-1]))
+        return np.concatenate([factors, thicknesses], axis=-1)
 
     @property
     def prior_factors(self) -> Float[np.ndarray, "laws fingers factors"]:
         """Logarithms of the factors of fingers from the prior of the population parameters."""
         random = np.random.default_rng([self.seed, 4])
-        laws = self.hierarchy.sample_prior(random, self.laws).shift_medians(self.at)
-        return self._draw_factors(random, laws)
+        law = self.hierarchy.sample_prior(random, self.laws).shift_means(self.at)
+        deviates = random.standard_normal((self.laws, self.fingers_per_law, *law.log_sd.shape[1:]))
+        return self._add_thicknesses(law.make_factors(deviates), random)
 
-    def _draw_factors(
-        self, random: np.random.Generator, parameters: PopulationParameters
-    ) -> Float[np.ndarray, "laws fingers factors"]:
-        return draw_factors(parameters, self.scene.thickness_sd(), self.fingers_per_law, random)
+    @functools.cached_property
+    def level_variances(self) -> LevelVariances:
+        """Variances of logarithms of Rsc, Csc, area, g, b and the mean force by level."""
+        return LevelVariances.from_parameters(draw_parameters(self, self.laws), self.nesting, self.finger)
+
+    @functools.cached_property
+    def forecasts(self) -> dict[str, dict[str, Float[np.ndarray, "laws fingers"]]]:
+        """Draws of the values typical of a new unit of the top level, and of the next touch of each known finger.
+
+        The first has the top level's name, with no effects of the levels below; the others are names of people or
+        fingers. There are none if the records have a single level.
+        """
+        levels = self.nesting.levels
+        if len(levels) < 2:
+            return {}
+        random, law, fingers = np.random.default_rng([self.seed, 9]), draw_parameters(self, self.laws), 4
+        shape = (self.laws, fingers, len(levels), len(self.hierarchy.components))
+        deviates = random.standard_normal(shape)
+        deviates[:, :, 1:] = 0.0
+        factors = {levels[0].name: law.make_factors(deviates)}
+        known = max(i for i, level in enumerate(levels[:-1]) if i == 0 or level.name != "session")
+        roots = np.asarray(law.effect_roots())[:, known + 1 :]
+        for unit, sums in zip(
+            levels[known].units, np.moveaxis(self._draw_known_sums(known, random), 1, 0), strict=True
+        ):
+            lower = np.einsum("plij,pflj->pfi", roots, random.standard_normal(shape)[:, :, known + 1 :])
+            factors[unit] = law.add_Ci(law.mean[:, None] + sums[:, None] + lower)
+        return {
+            name: dict(
+                zip(self.finger.names, np.moveaxis(self.finger.evaluate(self._add_thicknesses(each, random)), -1, 0),
+                    strict=True)
+            )
+            for name, each in factors.items()
+        }  # fmt: skip
+
+    def _draw_known_sums(self, level: int, random: np.random.Generator) -> Float[np.ndarray, "laws units components"]:
+        """Draw the sums of the effects down to a level for the units of the records."""
+        counts, components = self.hierarchy.effects.counts, len(self.hierarchy.components)
+        deviates = (random.standard_normal((self.laws, units, components)) for units in counts)
+        draw = BatchEvaluator(Hierarchy.draw_sums, self.hierarchy, sum(counts) * self.hierarchy.origin.size, batch=256)
+        sums = draw(spread_points(self, self.laws), *deviates)
+        first = sum(counts[:level])
+        return sums[:, first : first + counts[level]]
 
     @functools.cached_property
     def _new_predictions(self) -> Float[np.ndarray, "moments laws fingers names"]:
@@ -202,7 +287,7 @@ class Population(Display):
 
     @functools.cached_property
     def _prior_predictions(self) -> Float[np.ndarray, "laws fingers names"]:
-        return self.finger.evaluate(self.prior_factors)
+        return self.finger.evaluate(self.prior_factors[:, :8])  # the prior's wide range takes time
 
     @functools.cached_property
     def shares(self) -> SobolIndices:
@@ -222,22 +307,37 @@ class Population(Display):
         new: dict[str, dict[str, Any]] = {}
         for i, (name, values) in enumerate(self.new_fingers().items()):
             people = finger_variance_fraction(values)
-            shares = {"people": people, "ignorance": 1.0 - people}
+            shares: dict[str, Any] = {"people": people, "ignorance": 1.0 - people}
+            others = [
+                people * redrawn_variance_fraction(self._new_predictions[[0, j], ..., i])
+                for j in range(1, len(self._new_predictions))
+            ]
             if self.within is not None:
-                within = people * intrafinger_variance_fraction(self._new_predictions[..., i])
+                within, *others = others
                 shares |= {"within_finger": within, "between_fingers": people - within}
                 shares |= {"population_parameters": 1.0 - people}
+            if others:  # what differs below each level, from the lowest
+                below = [people, *others[::-1], shares.get("within_finger", 0.0)]
+                names = [level.name for level in self.nesting.levels]
+                shares["levels"] = dict(zip(names, -np.diff(below), strict=True))
             new[name] = summary.summarize_draws(name, values) | {"variance": shares}
         return {
             "population": self._parameter_summaries(),
             "new_finger": new,
+            "levels": self.level_variances.to_dict(),
+            "forecasts": {
+                name: {key: summary.summarize_draws(key, values[key]) for key in NAMES}
+                for name, values in self.forecasts.items()
+            },
+            "next_studies": self.level_variances.plan_studies(self.seed),
             **({} if self.within is None else self.within.to_dict()),
             "variance_shares": self.shares,
             "variance_shares_prior": self.prior_shares,
             "fingers": [
                 {"record": finger.source, "sha256": finger.fingerprint, "result": finger.result}
                 | {"message": finger.message, "parameters": finger.parameters}
-                for finger in self.fingers
+                | {"units": {level.name: level.units[level.unit_numbers[number]] for level in self.nesting.levels}}
+                for number, finger in enumerate(self.fingers)
             ],
             "convergence": dataclasses.asdict(self.convergence) | {"sentence": str(self.convergence)},
             "integrals_off": self.off,
@@ -264,7 +364,10 @@ class Population(Display):
             law[AREA] = {"log_sd": summary.summarize_draws("log_sd", draws["log_sd_area"])}
         law["covariates"] = {
             name: {"mean": float(mean), "sd": float(sd), "next_finger": float(mean + at * sd)}
-            | {skin: {"slope": summary.summarize_draws("slope", draws[f"slope_{skin}_{name}"])} for skin in SKIN}
+            | {
+                each: {"slope": summary.summarize_draws("slope", draws[f"slope_{each}_{name}"])}
+                for each in ([*SKIN, "area"] if self.hierarchy.area_varies else SKIN)
+            }
             for name, mean, sd, at in zip(
                 self.covariates.names, self.covariates.mean, self.covariates.sd, self.at, strict=True
             )
@@ -275,7 +378,10 @@ class Population(Display):
         """Return the table for people, the variance of the force by source, notes and warnings."""
         content = self.to_dict()
         rows = align_table(population_table(content))
-        rows += [*variance_sentences(content), SHARES_LEGEND, str(self.convergence)]
+        rows += [*variance_sentences(content), SHARES_LEGEND]
+        if content["next_studies"]:
+            rows += ["Larger studies, in brackets relative to this one:", *align_table(study_table(content))]
+        rows += [str(self.convergence)]
         return join_lines(rows, self.warnings, self.notes)
 
     __str__ = summary
@@ -295,7 +401,10 @@ class Population(Display):
         """
 
         def dataset(draws: dict[str, np.ndarray], dims: tuple[str, str]) -> Any:
-            units = {name: "1" if name.startswith(("log_sd", "slope")) else quantity_unit(name) for name in draws}
+            units = {
+                name: "1" if name.startswith(("log_sd", "slope", "correlation")) else quantity_unit(name)
+                for name in draws
+            }
             return to_dataset({name: (dims, values, {"units": units[name]}) for name, values in draws.items()})
 
         new_fingers = dataset(self.new_fingers(), ("law", "finger"))
@@ -361,7 +470,8 @@ class Population(Display):
         law = self._parameter_draws
         medians = {name: summary.summarize_draws(name, np.exp(x)) for name, x in log_medians(law).items()}
         state = "reliable" if self.trusted else "unreliable"
-        return f"{len(self.fingers)} fingers, medians {summary.format_estimates(medians)}, {state}"
+        units = [{"level": level.name, "units": len(level.units)} for level in self.nesting.levels]
+        return f"{describe_units(units)}, medians {summary.format_estimates(medians)}, {state}"
 
     def _rows(self) -> tuple[tuple[str, ...], ...]:
         return population_table(self.to_dict())
@@ -377,23 +487,74 @@ class Population(Display):
 
 def population_table(content: dict[str, Any]) -> tuple[tuple[str, ...], ...]:
     """Return titles, then rows of the population and the next finger from population.json, for people."""
-    law, new = content["population"], content["new_finger"]
-    shown = {f"{name}, {key}": s for name in SKIN for key, s in law[name].items()}
+    law, new, levels = content["population"], content["new_finger"], content["levels"]
+    next_one = describe_next_touch(levels)
+    shown = {f"{name}, median": law[name]["median"] for name in SKIN}
+    if len(levels) < 2:
+        shown |= {f"{name}, log_sd": law[name]["log_sd"] for name in SKIN}
     shown |= {name: law[name] for name in (SHARED_PARAMETER, "correlation")}
-    if AREA in law:
+    if AREA in law and len(levels) < 2:
         shown["contact area, log_sd"] = law[AREA]["log_sd"]
-    shown |= {f"{skin}, slope in {name}": x[skin]["slope"] for name, x in law["covariates"].items() for skin in SKIN}
+    shown |= {
+        f"{each}, slope in {name}": x[each]["slope"]
+        for name, x in law["covariates"].items()
+        for each in (*SKIN, "area")
+        if each in x
+    }
+    if len(levels) > 1:
+        for level in levels:
+            between = f"between {UNIT_NAMES[level['level']][1]}"
+            shown |= {f"{between}, {_quantity(name)}, log_sd": s for name, s in level["log_sd"].items()}
+        for level in levels[:-1]:
+            same = f"touches of one {UNIT_NAMES[level['level']][0]}"
+            found = level["intraclass_correlation"]
+            shown |= {f"{same}, {name}, correlation": found[name] for name in (*SKIN, "force_mean")}
     within = content.get("within_finger", {})
     shown |= {f"within a finger, {name}, log_sd": each["log_sd"] for name, each in within.items()}
-    shown |= {f"next finger, {name}": new[name] for name in NAMES}
+    shown |= {f"{next_one}, {name}": new[name] for name in NAMES}
     rows = [(name, *format_quantiles(s)) for name, s in shown.items()]
     if "friction" not in content["scene"]:  # two defaults give it, so more digits would mislead
-        name, s = "next finger, friction_mean", new["friction_mean"]
+        name, s = f"{next_one}, friction_mean", new["friction_mean"]
         cells = (format_engineering(float(f"{s[key]:.2g}"), s["unit"], 3) for key in ("q50", "q025", "q975"))
         rows = [(name, *cells) if row[0] == name else row for row in rows]
     if AREA not in law:
         rows.insert(len(rows) - len(NAMES), ("contact area", "common", "(assumed)", ""))
-    return (f"{len(content['fingers'])} fingers", "median", "2.5 % quantile", "97.5 % quantile"), *rows
+    return (describe_units(levels), "median", "2.5 % quantile", "97.5 % quantile"), *rows
+
+
+def describe_units(levels: Sequence[Mapping[str, Any]]) -> str:
+    """Return e.g. "8 fingers", or "18 touches of 6 people", from the entry `levels` of population.json."""
+    counts = [f"{level['units']} {UNIT_NAMES[level['level']][1]}" for level in levels]
+    return counts[0] if len(counts) == 1 else f"{counts[-1]} of {counts[0]}"
+
+
+def describe_next_touch(levels: Sequence[Mapping[str, Any]]) -> str:
+    """Return e.g. "next finger", or "touch of a new person"."""
+    top = UNIT_NAMES[levels[0]["level"]][0]
+    return f"next {top}" if len(levels) == 1 else f"touch of a new {top}"
+
+
+def _quantity(name: str) -> str:
+    return name.replace("contact_area", "contact area")
+
+
+def study_table(content: dict[str, Any]) -> tuple[tuple[str, ...], ...]:
+    """Return titles, then rows of the present and larger studies from population.json; none for a single level."""
+    entries, levels = content["next_studies"], content["levels"]
+    if not entries:
+        return ()
+    units, now = UNIT_NAMES[levels[0]["level"]][1], entries[0]
+    rows = [
+        (
+            str(each["units"]),
+            str(each["repetitions"]),
+            str(each["records"]),
+            *(f"{format_percent(each[key])} ({each[key] / now[key]:.2f})" for key in ("median_u", "log_sd_u")),
+        )
+        for each in entries
+    ]
+    titles = units, "repetitions", "records", "u of the median force", f"u of the spread between {units}"
+    return titles, *rows
 
 
 def format_quantiles(s: dict[str, Any], keys: Sequence[str] = ("q50", "q025", "q975")) -> list[str]:
@@ -417,11 +578,16 @@ def variance_sentences(content: dict[str, Any]) -> tuple[str, ...]:
     sentences = []
     for name in VARIANCE_QUANTITIES:
         variance = content["new_finger"][name]["variance"]
-        sources = {
-            "within_finger": "from changes within a finger",
-            "between_fingers" if "within_finger" in variance else "people": "from differences between fingers",
-            "ignorance": "from uncertainty of the population parameters",
-        }
+        sources = {"within_finger": "from changes within a finger"}
+        if "levels" in variance:
+            variance = variance | variance["levels"]
+            sources |= {
+                level: f"from differences between {UNIT_NAMES[level][1]}" for level in reversed(variance["levels"])
+            }
+        else:
+            key = "between_fingers" if "within_finger" in variance else "people"
+            sources[key] = f"from differences between {UNIT_NAMES[content['levels'][0]['level']][1]}"
+        sources["ignorance"] = "from uncertainty of the population parameters"
         sizes = ", ".join(
             f"{format_variance_part(variance[part])} {text}" for part, text in sources.items() if part in variance
         )
@@ -434,16 +600,24 @@ def variance_sentences(content: dict[str, Any]) -> tuple[str, ...]:
 
 
 @jit
-def evaluate_parameters(hierarchy: Hierarchy, points: Float[Array, "chains draws n"]) -> PopulationParameters:
-    return jax.vmap(jax.vmap(hierarchy.population_parameters))(points)
+def evaluate_parameters(hierarchy: Hierarchy, points: Float[Array, "*shape n"]) -> PopulationParameters:
+    evaluate = hierarchy.population_parameters
+    for _ in range(points.ndim - 1):
+        evaluate = jax.vmap(evaluate)
+    return evaluate(points)
+
+
+def spread_points(population: Population, count: int) -> Float[np.ndarray, "count n"]:
+    """Take `count` points, spread over the chain."""
+    flat = population.points.reshape(-1, population.points.shape[-1])
+    return flat[np.linspace(0, len(flat) - 1, count).astype(int)]
 
 
 def draw_parameters(population: Population, count: int) -> PopulationParameters:
-    """Take `count` draws of the next finger's population parameters, spread over the chain; leaves (count, 1)."""
-    flat = population.points.reshape(-1, population.points.shape[-1])
-    points = flat[np.linspace(0, len(flat) - 1, count).astype(int), None]
-    return evaluate_parameters(population.hierarchy, points).shift_medians(population.at)
+    """Take `count` draws of the next finger's population parameters, spread over the chain."""
+    law = evaluate_parameters(population.hierarchy, spread_points(population, count))
+    return jax.tree.map(np.asarray, law).shift_means(population.at)
 
 
 def log_medians(parameters: PopulationParameters) -> dict[str, np.ndarray]:
-    return {"Rsc": parameters.median[..., 0], "Csc": parameters.median[..., 1], SHARED_PARAMETER: parameters.log_Ci}
+    return {"Rsc": parameters.mean[..., 0], "Csc": parameters.mean[..., 1], SHARED_PARAMETER: parameters.log_Ci}

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from fitact import summary
 from fitact.model.circuit import FINGER_PARAMETERS
+from fitact.populations.finger import SHARED_PARAMETER
 from fitact.populations.next_finger import NewFingerModel
 from fitact.tracking.tracked_finger import TrackedFinger
 from fitact.units import format_engineering
@@ -94,7 +95,13 @@ class WithinFinger(NamedTuple):
         windows = np.array([each.windows for each in averages], dtype=float)
         covariance = _nearest_covariance(within.mean(axis=0), noise.mean(axis=0))
         pooled, expected = {}, {}
-        for name, slope in _log_gradients(finger, logs).items():
+        others = len(finger.factors) - len(FINGER_PARAMETERS)
+        gradients = finger.log_gradients(np.pad(logs, ((0, 0), (0, others))))
+        gradients[SHARED_PARAMETER] = np.tile(np.array(finger.factors) == SHARED_PARAMETER, (len(logs), 1)).astype(
+            float
+        )
+        for name in (*FINGER_PARAMETERS, *FORCES):
+            slope = gradients[name][:, : len(FINGER_PARAMETERS)]
             found, errors = (np.einsum("fi,fij,fj->f", slope, each, slope) for each in (within, noise))
             expected[name] = float(np.mean(np.einsum("fi,ij,fj->f", slope, covariance, slope)))
             if np.all(errors > 0.0):  # not where the records do not show changes of Ci
@@ -153,19 +160,6 @@ class WithinFinger(NamedTuple):
                 " changes within a finger are subtracted from its part in the differences between fingers"
             )
         return sentences
-
-
-def _log_gradients(
-    finger: NewFingerModel, logs: Float[np.ndarray, "fingers 3"], step: float = 1e-3
-) -> dict[str, Float[np.ndarray, "fingers 3"]]:
-    """Return the gradients of the logarithms of quantities in log Rsc, log Csc and log Ci, at the fingers."""
-    signs = np.concatenate([np.eye(3), -np.eye(3)])
-    points = np.zeros((len(logs), 6, len(finger.factors)))
-    points[..., :3] = logs[:, None] + step * signs
-    values = np.log(finger.evaluate(points))
-    gradients = np.einsum("fpq,pi->qfi", values, signs) / (2.0 * step)
-    own = {name: np.tile(row, (len(logs), 1)) for name, row in zip(FINGER_PARAMETERS, np.eye(3), strict=True)}
-    return own | {name: gradients[finger.names.index(name)] for name in FORCES}
 
 
 def _nearest_covariance(

@@ -12,7 +12,7 @@ from typing import Any
 from fitact.charts.figure import write_figure
 from fitact.charts.population import (
     NOT_DRAWN_MESSAGE,
-    PANELS,
+    choose_panels,
     draw_panel,
     draw_population,
     force_chart,
@@ -22,13 +22,17 @@ from fitact.charts.population import (
 from fitact.errors import InputError
 from fitact.files import read_datatree
 from fitact.model.circuit import FINGER_PARAMETERS
+from fitact.populations.exact_likelihood import MAX_INTEGRATION_ERROR
 from fitact.populations.population import (
-    MAX_INTEGRATION_ERROR,
     SHARES_LEGEND,
+    UNIT_NAMES,
     VARIANCE_QUANTITIES,
+    describe_next_touch,
+    describe_units,
     format_quantiles,
     format_variance_part,
     population_table,
+    study_table,
     variance_sentences,
 )
 from fitact.report.frame import Answer, PageSummary, Provenance, image, write_page
@@ -50,7 +54,17 @@ _NAMES = {
     "friction_at_f": "friction at f",
     "friction_at_2f": "friction at 2 f",
 }
-_NUMERIC = ("population", "new_finger", "variance_shares", "variance_shares_prior", "fingers", "convergence")
+_NUMERIC = (
+    "population",
+    "levels",
+    "forecasts",
+    "next_studies",
+    "new_finger",
+    "variance_shares",
+    "variance_shares_prior",
+    "fingers",
+    "convergence",
+)
 
 
 def write_population(path: str | os.PathLike[str], tree: Any, content: dict[str, Any]) -> None:
@@ -61,6 +75,7 @@ def write_population(path: str | os.PathLike[str], tree: Any, content: dict[str,
 def write_population_page(path: str | os.PathLike[str], tree: Any, content: dict[str, Any]) -> None:
     """Write the page from the content of population.nc and population.json."""
     content = content | {name: _null_to_nan(content[name]) for name in (*_NUMERIC, "integrals_off")}
+    next_touch = describe_next_touch(content["levels"])
     write_page(
         path,
         "population.html",
@@ -68,7 +83,12 @@ def write_population_page(path: str | os.PathLike[str], tree: Any, content: dict
         origin=_origin(content),
         content=content,
         **_figures(tree, content),
-        law=[row for row in population_table(content) if not row[0].startswith("next finger")],
+        law=[row for row in population_table(content) if not row[0].startswith(next_touch)],
+        units=describe_units(content["levels"]),
+        next_touch=next_touch,
+        top=UNIT_NAMES[content["levels"][0]["level"]],
+        forecasts=tuple(_forecast_rows(content)),
+        studies=study_table(content),
         fingers=tuple(_finger_rows(content)),
         new=tuple(_new_rows(content)),
         shares={name: tuple(_share_rows(content, name)) for name in VARIANCE_QUANTITIES},
@@ -80,7 +100,7 @@ def read_population(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, A
     """Read what `write_population_page` needs from a folder of results; raise InputError if it is incomplete."""
     try:
         content = json.loads((Path(directory) / "population.json").read_text(encoding="utf-8"))
-        if not (isinstance(content, dict) and "trusted" in content):
+        if not (isinstance(content, dict) and {"trusted", "levels"} <= set(content)):
             raise ValueError("population.json is not this version's")
         return read_datatree(Path(directory) / "population.nc"), content
     except (OSError, ValueError, TypeError, KeyError) as error:
@@ -103,36 +123,39 @@ def _null_to_nan(content: Any) -> Any:
 def _figures(tree: Any, content: dict[str, Any]) -> dict[str, Any]:
     if not is_drawable(tree):
         return {"panels": None, "not_drawn": NOT_DRAWN_MESSAGE}
-    panels = {name: image(functools.partial(draw_panel, draw, tree, content)) for name, draw in PANELS.items()}
+    chosen = choose_panels(content)
+    panels = {name: image(functools.partial(draw_panel, draw, tree, content)) for name, draw in chosen.items()}
     return {"panels": panels, "skin": skin_chart(tree, content), "force": force_chart(tree)}
 
 
 def _frame(content: dict[str, Any]) -> PageSummary:
-    law, new, count = content["population"], content["new_finger"], len(content["fingers"])
+    law, new, levels = content["population"], content["new_finger"], content["levels"]
+    units, next_touch = describe_units(levels), describe_next_touch(levels)
+    _, several = UNIT_NAMES[levels[0]["level"]]
     force, friction = new["force_mean"], new["friction_mean"]
     # two defaults give the friction of a scene that states none
     stated_friction = f" Mean friction {_format_range(friction)}." if "friction" in content["scene"] else ""
     off = f"{content['integrals_off']:.2g} standard deviations"
-    accuracy = f"the integrals over the fingers shift no mean by more than {off}"
+    accuracy = f"the error of the records' likelihoods shifts no mean by more than {off}"
     return PageSummary(
-        title=f"Population of {count} fingers",
-        subject=f"Differences between fingers, estimated from one record of each of {count} fingers on one panel, and"
-        " the force on the next finger.",
+        title=f"Population: {units}",
+        subject=f"Differences between {several}, estimated from records of {units} on one panel, and the force on the"
+        f" {next_touch}.",
         trusted=content["trusted"],
         verdict=f"Reliable: the chain has converged, and {accuracy}"
         if content["trusted"]
         else f"{content['convergence']['sentence']}; {accuracy} (at most {MAX_INTEGRATION_ERROR:g} are accepted).",
         findings={
-            "Force on the next finger": f"Mean electrostatic force {_format_range(force)}, with 95 % prediction"
+            f"Force on the {next_touch}": f"Mean electrostatic force {_format_range(force)}, with 95 % prediction"
             f" interval.{stated_friction}",
             "Sources of variance": "; ".join(variance_sentences(content)) + f". {SHARES_LEGEND}",
         }
         | ({"Contact area": _sentence(content["contact_area"]["sentence"])} if "contact_area" in content else {}),
         answers=[
-            _answer("Rsc, median of fingers", law["Rsc"]["median"]),
-            _answer("Csc, median of fingers", law["Csc"]["median"]),
+            _answer(f"Rsc, median of {several}", law["Rsc"]["median"]),
+            _answer(f"Csc, median of {several}", law["Csc"]["median"]),
             _answer("Ci of the panel", law["Ci"]),
-            _answer("mean force on the next finger", force),
+            _answer(f"mean force on the {next_touch}", force),
         ],
         warnings=content["warnings"],
     )
@@ -161,24 +184,43 @@ def _origin(content: dict[str, Any]) -> Provenance:
 
 
 def _finger_rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
-    yield ("finger", "Rsc ± 1 sd", "Csc ± 1 sd", "Ci ± 1 sd", "fit")
+    yield ("record", "Rsc ± 1 sd", "Csc ± 1 sd", "Ci ± 1 sd", "fit")
     for each in content["fingers"]:
         cells = (format_estimate(each["parameters"][name]) for name in FINGER_PARAMETERS)
         yield (each["record"], *cells, each["result"])
 
 
+def _forecast_rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
+    """Yield titles, then rows of a typical new person, and of the next touch of each known one; none for a level."""
+    levels = content["levels"]
+    if not content["forecasts"]:
+        return
+    quantities = ("Rsc", "Csc", "force_mean", "force_peak")
+    yield ("forecast, 95 %", *(_NAMES[name] for name in quantities))
+    for name, values in content["forecasts"].items():
+        new = name == levels[0]["level"]
+        title = f"a new {UNIT_NAMES[name][0]}, typical" if new else f"{name}, next touch"
+        yield (title, *(_format_range(values[quantity]) for quantity in quantities))
+
+
 def _new_rows(content: dict[str, Any]) -> Iterator[tuple[str, ...]]:
-    parts = {"people": "between fingers", "ignorance": "parameters"}
+    levels = content["levels"]
+    parts = {"people": f"between {UNIT_NAMES[levels[0]['level']][1]}", "ignorance": "parameters"}
     if "within_finger" in content:
         parts = {"within_finger": "within a finger", "between_fingers": "between fingers", "ignorance": "parameters"}
-    yield ("next finger", *_QUANTILES.values(), *parts.values())
+    if len(levels) > 1:
+        lowest = {"within_finger": "within a finger"} if "within_finger" in content else {}
+        between = {level["level"]: f"between {UNIT_NAMES[level['level']][1]}" for level in reversed(levels)}
+        parts = lowest | between | {"ignorance": "parameters"}
+    yield (describe_next_touch(levels), *_QUANTILES.values(), *parts.values())
     none = 1e-12 * content["new_finger"]["force_mean"]["q50"]  # smaller forces are rounding errors
     for name, s in content["new_finger"].items():
         values = (
             format_engineering(s[key] if s["unit"] != "N" or s["q975"] > none else 0.0, s["unit"], 3)
             for key in _QUANTILES
         )
-        yield (_NAMES[name], *values, *(format_variance_part(s["variance"][key]) for key in parts))
+        variance = s["variance"] | s["variance"].get("levels", {})
+        yield (_NAMES[name], *values, *(format_variance_part(variance[key]) for key in parts))
 
 
 def _share_rows(content: dict[str, Any], name: str) -> Iterator[tuple[str, ...]]:

@@ -318,6 +318,59 @@ def test_changed_inputs_and_settings_are_done_again(tmp_path: Path):
     assert key() != first
 
 
+@pytest.fixture
+def fitted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Replace the workers by rows made by hand, and return the paths that were fitted."""
+    paths: list[str] = []
+
+    def run(task: Task, batches: Any, journal: Journal, *_: object) -> None:
+        for batch in batches:
+            paths.extend(path for _, path in batch)
+            failed = {"result": "refused", "trusted": False, "message": "no"}
+            fitted = {"result": "successful", "trusted": True, "message": "yes", "samples": 9}
+            rows = [{"record": Path(path).name} | (failed if "r2" in path else fitted) for _, path in batch]
+            journal.add({key: row for (key, _), row in zip(batch, rows, strict=True)})
+
+    monkeypatch.setattr(module, "_run_batches", run)
+    return paths
+
+
+def write_study(path: Path, rows: str, header: str = "record,person,age,side") -> fitact.Study:
+    for name in ("r1.csv", "r2.csv"):
+        (path.parent / name).write_text(name)
+    path.write_text(f"{header}\n{rows}\n")
+    return fitact.Study.from_table(path)
+
+
+def test_a_study_adds_its_columns_and_a_changed_label_fits_nothing_again(fitted: list[str], tmp_path: Path):
+    path = tmp_path / "study.csv"
+    study = write_study(path, "r1.csv,P1,23,left\nr2.csv,P2,31,right")
+    first = fitact.run_campaign(study, tmp_path / "out", progress=False)
+    assert first[0] == {
+        "record": "r1.csv", "person": "P1", "age": 23.0, "side": "left",
+        "result": "successful", "trusted": True, "message": "yes", "samples": 9,
+    }  # fmt: skip
+    assert [(row["record"], row["person"], row["age"], row["side"]) for row in first.failures] == [
+        ("r2.csv", "P2", 31.0, "right")
+    ]
+    assert list(first.columns)[:4] == ["record", "person", "age", "side"]
+    assert [Path(name).name for name in fitted] == ["r1.csv", "r2.csv"]
+    journal = (tmp_path / "out" / JOURNAL).read_bytes()
+    study = write_study(path, "r1.csv,anna,23,left\nr2.csv,ben,32,right")
+    second = fitact.run_campaign(study, tmp_path / "out", progress=False)
+    assert [(row["person"], row["age"]) for row in second] == [("anna", 23.0), ("ben", 32.0)]
+    assert len(fitted) == 2
+    assert (tmp_path / "out" / JOURNAL).read_bytes() == journal
+    plain = fitact.run_campaign(write_study(path, "r1.csv\nr2.csv", "record"), tmp_path / "out", progress=False)
+    assert [list(row) for row in plain] == [["record", *list(first[0])[4:]], ["record", "result", "trusted", "message"]]
+
+
+def test_a_covariate_with_the_name_of_a_result_is_refused(fitted: list[str], tmp_path: Path):
+    study = write_study(tmp_path / "study.csv", "r1.csv,1\nr2.csv,2", "record,samples")
+    with pytest.raises(fitact.InputError, match=r"study\.csv: samples is also a column of the results; rename it"):
+        fitact.run_campaign(study, tmp_path / "out", progress=False)
+
+
 def test_a_file_named_twice_is_refused(tmp_path: Path):
     with pytest.raises(fitact.InputError, match="twice"):
         fitact.run_campaign([tmp_path / "a.csv", tmp_path / "a.csv"], tmp_path)

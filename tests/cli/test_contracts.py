@@ -85,6 +85,7 @@ CASES = [
     pytest.param("fit", [*FINGER, "--intervals"], id="fit --intervals", marks=OWN),
     pytest.param("fit", ["z.csv"], id="fit a spectrum"),
     pytest.param("inspect", [FINGER[0]], id="inspect"),
+    pytest.param("inspect study.csv", [], id="inspect a table"),
     pytest.param("plan", ["natural-ground"], id="plan"),
     pytest.param("simulate", ["phone", "--out", "phone.csv"], id="simulate"),
     pytest.param("prior", ["paper"], id="prior", marks=OWN),
@@ -114,6 +115,7 @@ CASES = [
 def test_keys_are_those_of_the_page(command, arguments, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("felt.toml").write_text('[perception]\nthreshold_force = "0.1 mN"\n')
+    Path("study.csv").write_text(f"record,person,age\n{FINGER[0]},P1,23\n{FINGER[2]},P2,31\n")
     frequency = np.geomspace(1.0, 1e5, 30)
     z = 3e5 / (1.0 + 1j * frequency / 50.0) - 1e8j / frequency
     np.savetxt("z.csv", np.column_stack([frequency, z.real, z.imag]), delimiter=",", header="f,Z',Z''", comments="")

@@ -13,7 +13,7 @@ import scipy.signal
 import scipy.stats
 
 import fitact
-from data_synth import files, imperfections, keys, make, recipe
+from data_synth import files, imperfections, keys, make, population, recipe
 from data_synth.errors import RecipeError
 
 RECORDS = Path(__file__).parents[2] / "data_synth" / "records"
@@ -137,7 +137,7 @@ def test_kinds_channels_and_fingers_have_random_numbers_of_their_own():
     """The correlation of any two streams is below five standard errors; chance exceeds it once in a million pairs."""
     streams = [
         imperfections.generator(1, finger, kind, channel).standard_normal(2000)
-        for kind in ("population", "clock", "hum", "pink", "white", "missing")
+        for kind in ("population", "clock", "hum", "pink", "white", "missing", "finger", "session", "repetition")
         for channel in ("V", "Vsc", "I")
         for finger in range(3)
     ]
@@ -158,8 +158,8 @@ def test_people_follow_their_law(tmp_path: Path):
     law = "[population]\nfingers = 4000\nlog_sd_Rsc = 0.3\nlog_sd_Csc = 0.5\ncorrelation = -0.6\n"
     found = {}
     for area in (0.0, 0.2):
-        people = make._population(written(tmp_path, f"{law}log_sd_area = {area}"))
-        skin = [(each["skin"]["Rsc"], each["skin"]["Csc"], each["device"]["Ci"]) for each in people]
+        scenes = [each.scene for each in population.draw_touches(written(tmp_path, f"{law}log_sd_area = {area}"))]
+        skin = [(each["skin"]["Rsc"], each["skin"]["Csc"], each["device"]["Ci"]) for each in scenes]
         found[area] = np.log(skin).T
     logs = found[0.0][:2]
     error = 4.0 / np.sqrt(2.0 * 4000)
@@ -195,6 +195,17 @@ BAD = {
     "measured": ("", '[drive]\nwaveform = "measured"', "[truth.drive]"),
     "current of an ideal square": ("", '[measurement]\nchannels = ["I"]', "impulse"),
     "no samples": ("", '[measurement]\nduration = "1 ns"', "0 samples"),
+    "people and fingers": ("[population]\npeople = 3\nfingers = 2", "", "[population] has people and fingers; write"),
+    "nobody": ("[population]\nlog_sd_Rsc = 0.3", "", "[population] has neither people nor fingers; state"),
+    "levels of fingers": ("[population]\nfingers = 2\nrepetitions = 3", "", "[population] repetitions needs people"),
+    "effects of fingers": (
+        "[population]\nfingers = 2\nlog_sd_Csc_session = 0.1",
+        "",
+        "log_sd_Csc_session needs people",
+    ),
+    "no people": ("[population]\npeople = 0", "", "[population] people = 0; write a whole number of at least 1"),
+    "negative effects": ("[population]\npeople = 2\nlog_sd_area_finger = -1", "", "must be at least 0"),
+    "a level that is none": ("[population]\npeople = 2\nlog_sd_Rsc_touch = 0.1", "", "did you mean 'log_sd_Rsc"),
     "not TOML": ("[white", "", "cannot be read as TOML"),
 }
 
@@ -257,9 +268,14 @@ def test_the_committed_records_can_be_made_again_without_fitact(tmp_path: Path):
     done = run("committed", "--out", str(tmp_path))
     assert done.returncode == 0, done.stderr
     committed = sorted(path.relative_to(RECORDS) for path in RECORDS.rglob("*.json") if has_recipe(path))
-    assert len(committed) > 18
+    assert len(committed) > 36
     for path in committed:
         kept = read(RECORDS / path)
+        if path.name == "truth.json":
+            assert read(tmp_path / path) == kept
+            tables = [(folder / path).with_name("study.csv").read_text() for folder in (RECORDS, tmp_path)]
+            assert tables[0] == tables[1]
+            continue
         if kept["origin"]["route"] == "ngspice" and shutil.which("ngspice") is None:
             assert "ngspice is not installed" in done.stderr
             continue

@@ -23,11 +23,14 @@ from fitact.charts import draw_drive_design
 from fitact.charts.figure import write_figure
 from fitact.cli import run_command
 from fitact.cli.app import app
+from fitact.data.study import nest_levels
 from fitact.design.drive import _DriveEvaluator
 from fitact.design.drive_option import DriveOption, quantile, quantile_error
 from fitact.design.drive_people import FingerSample
 from fitact.model.steady_cycle import period_quantities
-from fitact.populations.finger_likelihoods import PopulationParameters
+from fitact.populations import population_draws
+from fitact.populations.population_draws import PopulationDraws
+from fitact.populations.population_parameters import PopulationParameters
 
 EPS0, AREA, TI, TSC = 8.85e-12, 1e-4, 1e-6, 200e-6
 R, C, CI, F, RISE = 160e3, 22e-9, 1.35e-9, 100.0, 50e-6
@@ -473,7 +476,7 @@ TABLE = {"frequencies": [20.0, 250.0], "forces": [1e-2, 1e-3], "source": "test"}
 
 def felt(waveform: str, frequency: float) -> DriveOption:
     stated = fitact.Scene.from_dict({"perception": {"thresholds": TABLE}, "friction": {"coefficient": 0.4}})
-    return _DriveEvaluator(stated, one_finger(), 0.5).evaluate(waveform, frequency)[0]
+    return _DriveEvaluator(stated, one_finger(), 0.5, 0.9).evaluate(waveform, frequency)[0]
 
 
 def test_a_table_of_thresholds_gives_the_amplitude_of_a_sine():
@@ -593,34 +596,34 @@ def test_people_are_those_of_the_population(eight):
     assert np.std(off) < 0.2 * np.std(np.log(option.amplitude))
 
 
-class _FixedHierarchy:
-    def population_parameters(self, _: np.ndarray) -> PopulationParameters:
-        return PopulationParameters(np.log([R, C]), np.zeros(2), 0.0, math.log(CI), 0.3)
-
-
-def population_of(results: list[str]) -> types.SimpleNamespace:
-    """A population that differs in its contact area only, with fits of these results."""
-    return types.SimpleNamespace(
-        hierarchy=_FixedHierarchy(),
-        points=np.zeros((1, 1000, 1)),
-        at=np.zeros(0),
-        fingers=tuple(types.SimpleNamespace(result=result) for result in results),
-        trusted=True,
-    )
+def draws_that_differ_in_area(*log_sds: float) -> PopulationDraws:
+    """A population that differs in its contact area only, by one level for each standard deviation."""
+    levels = ("person", "repetition")[: len(log_sds)]
+    log_sd = np.tile([[0.0, 0.0, each] for each in log_sds], (512, 1, 1))
+    mean = np.tile([math.log(R), math.log(C), 0.0], (512, 1))
+    zeros = np.zeros((512, len(log_sds)))
+    law = PopulationParameters(mean, log_sd, zeros, np.full(512, math.log(CI)), np.zeros((512, 0, 3)))
+    return PopulationDraws(law, levels, "5 people", True, ())
 
 
 @pytest.mark.parametrize(("poor", "trusted"), [(2, True), (3, False)])
-def test_a_population_of_mostly_poor_fits_is_not_designed_for(poor: int, trusted: bool):
+def test_a_population_of_mostly_poor_fits_is_not_designed_for(poor: int, trusted: bool, monkeypatch):
     """Two of five fingers may be poor, three may not."""
-    sample = FingerSample.from_population(population_of(["misfit"] * poor + ["successful"] * (5 - poor)), scene())
-    assert sample.trusted == trusted
+    results = ["misfit"] * poor + ["successful"] * (5 - poor)
+    fitted = types.SimpleNamespace(
+        nesting=nest_levels({}, 5),
+        fingers=[types.SimpleNamespace(result=result) for result in results],
+        trusted=True,
+        warnings=(),
+    )
+    monkeypatch.setattr(population_draws, "draw_parameters", lambda *_: draws_that_differ_in_area(0.3).law)
+    assert PopulationDraws.from_population(fitted, 1).trusted == trusted
 
 
 def test_an_area_scales_capacitances_up_and_the_resistance_down():
     """Fingers of one population sample differ in their area only; tied parameters follow."""
-    population = population_of([])
     tied = scene(prior={"grounding_Rsc": {"tied": "Rsc", "ratio": 3}, "R_H": {"fixed": "500 ohm"}})
-    sample = FingerSample.from_population(population, tied)
+    sample = FingerSample.from_population(draws_that_differ_in_area(0.3), tied)
     assert "each with its own contact area" in sample.source
     values = sample.values
     area = values["Ci"] / CI
@@ -629,6 +632,25 @@ def test_an_area_scales_capacitances_up_and_the_resistance_down():
     assert np.std(np.log(area)) == pytest.approx(0.3, rel=1e-3)
     np.testing.assert_array_equal(values["grounding_Rsc"], 3.0 * values["Rsc"])
     assert np.all(values["R_H"] == 500.0)
+
+
+def test_people_feel_it_in_a_share_of_their_touches():
+    """The amplitude falls as a power of the area, nearly: its quantile over touches and people, by Monte Carlo."""
+    stated = scene(drive={"waveform": "sine"})
+    sample = FingerSample.from_population(draws_that_differ_in_area(0.2, 0.1), stated)
+    design = fitact.design_drive(stated, sample, 0.8, touches=0.9)
+    assert "80 % of people in 90 % of touches" in design.question
+    assert "at least 80 % of people then feel it in 90 % of touches" in design.recommendation
+    rng = np.random.default_rng(3)
+    area = np.exp(0.2 * rng.standard_normal((2000, 1)) + 0.1 * rng.standard_normal((2000, 2000)))
+    Rsc, Csc, Ci = R / area, C * area, CI * area
+    s = 2j * np.pi * F
+    gain = np.abs(s * Rsc * Ci / (1.0 + s * Rsc * (2.0 * Ci + Csc)))
+    needed = np.quantile(np.sqrt(8.0 * THRESHOLD / (per_square(Csc, Ci) * gain**2)), 0.9, axis=1)
+    # four standard errors of a quantile of 2,000 people are about 2 % of their spread of 0.2
+    assert np.median(design.options["sine"].amplitude) == pytest.approx(np.quantile(needed, 0.8), rel=0.02)
+    with pytest.raises(fitact.InputError, match=r"touches = 0: give a fraction of touches"):
+        fitact.design_drive(stated, sample, touches=0.0)
 
 
 @pytest.mark.slow

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.stats
 
 import fitact
 from fitact.data.readers.read import write_csv
 from fitact.populations.finger import Finger
-from fitact.populations.next_finger import intrafinger_variance_fraction
+from fitact.populations.next_finger import redrawn_variance_fraction
+from fitact.populations.record_files import RecordFiles
 from fitact.populations.within_finger import PooledVariance, WithinFinger, pool_variances
 from tests.within_calibration import CHANGE, Law, complete_places, records_of_changing_fingers
 
@@ -48,23 +48,17 @@ def test_blurred_finger_is_the_sum_of_two_normal_distributions():
     root = rng.normal(size=(3, 3)) * 0.1  # of log Rsc, log Csc, log Ci
     covariance, mean, within = root @ root.T, np.array([11.8, -17.7, -20.4]), np.diag([0.1, 0.2, 0.05]) ** 2
     within[0, 1] = within[1, 0] = 0.01
-    slope = covariance[:2, 2] / covariance[2, 2]
-    own = np.linalg.cholesky(covariance[:2, :2] - np.outer(slope, covariance[:2, 2]))
-    center, nuisance = mean[2] + 0.03, np.array([0.5])
-    finger = Finger(
-        "", "", "successful", "", {}, None, ("Rsc", "Csc", "Ci", "sigma"), center,
-        np.append(mean[:2] - slope * (mean[2] - center), nuisance), np.append(slope, 0.0),
-        scipy.linalg.block_diag(own, [[0.1]]), 1.0 / covariance[2, 2], (mean[2] - center) / covariance[2, 2],
-    )  # fmt: skip
+    nuisance, center = 0.5, mean + 0.03
+    factor = np.zeros((4, 4))
+    factor[0] = [2.0, 0.3, 0.2, -0.1]
+    factor[1:, 1:] = np.linalg.cholesky(np.linalg.inv(covariance)).T
+    target = factor @ np.append(0.0, mean - center)
+    names = ("Rsc", "Csc", "Ci", "R_H")
+    finger = Finger("", "", "successful", "", {}, None, names, np.append(nuisance, center), factor, target)
     found = finger.blur(within)
-    whole = covariance + within
-    assert found.precision == pytest.approx(1.0 / whole[2, 2], rel=1e-4)
-    assert found.center + found.weighted_offset / found.precision == pytest.approx(mean[2], abs=1e-5)
-    along = whole[:2, 2] / whole[2, 2]
-    np.testing.assert_allclose(found.slope, along, rtol=1e-4)
-    np.testing.assert_allclose(found.conditional_mean, mean[:2] + along * (center - mean[2]), atol=1e-5)
-    expected = whole[:2, :2] - np.outer(along, whole[:2, 2])
-    np.testing.assert_allclose(found.covariance_factor @ found.covariance_factor.T, expected, rtol=1e-4)
+    whole = np.linalg.inv(found.factor.T @ found.factor)
+    np.testing.assert_allclose(whole, covariance + within, rtol=1e-4)
+    np.testing.assert_allclose(found.center + np.linalg.solve(found.factor, found.target), mean, atol=1e-5)
 
 
 def test_deviations_have_the_pooled_covariance_and_their_part_of_the_variance():
@@ -77,7 +71,7 @@ def test_deviations_have_the_pooled_covariance_and_their_part_of_the_variance():
     np.testing.assert_allclose(np.cov(moves.reshape(-1, 3).T), 2.0 * covariance, atol=0.003)
     # an additive quantity: variances of 0.08 within, and of 0.24 between fingers
     moments = moves[..., 0] + np.sqrt(0.24) * rng.standard_normal((laws, fingers))
-    assert intrafinger_variance_fraction(moments) == pytest.approx(0.25, abs=0.015)
+    assert redrawn_variance_fraction(moments) == pytest.approx(0.25, abs=0.015)
 
 
 @pytest.mark.slow  # eight tracks of 10 s
@@ -119,8 +113,6 @@ def test_command_takes_folders_of_tracks_beside_records(tmp_path: Path):
 
 
 def test_track_without_a_finger_is_refused(tmp_path: Path):
-    from fitact.cli.options import LazyRecords
-
-    records = LazyRecords([tmp_path, tmp_path / "summary.json"], None, (None, None, None))
+    records = RecordFiles([tmp_path, tmp_path / "summary.json"], None)
     with pytest.raises(fitact.InputError, match="holds no complete track"):
         fitact.population(records)

@@ -91,6 +91,7 @@ def drive(trusted: bool = True) -> DriveDesign:
         scene,
         people,
         0.95,
+        None,
         {"sine": made("sine", 500.0), "square": made("square", 400.0, current=math.inf)},
         {"sine": needed, "square": 0.8 * needed},
         {name: tuple(made(name, 500.0, f) for f in (10.0, 100.0, 1000.0)) for name in ("sine", "square")},
@@ -128,10 +129,16 @@ def population(trusted: bool = True) -> tuple[xr.DataTree, dict[str, Any]]:
     def finger(record: str, result: str, Rsc: float) -> dict[str, Any]:
         values = {"Rsc": summary(Rsc, "ohm"), "Csc": summary(33e-9, "F"), "Ci": summary(1.43e-9, "F")}
         message = "" if result == "successful" else "residuals have a structure"
-        return {"record": record, "sha256": DIGEST, "result": result, "message": message, "parameters": values}
+        units = {"finger": record}
+        return {"record": record, "sha256": DIGEST, "result": result, "message": message, "parameters": values} | {
+            "units": units
+        }
 
     content = {
         "population": law,
+        "levels": [{"level": "finger", "units": 2, "log_sd": {}}],
+        "forecasts": {},
+        "next_studies": [],
         "new_finger": new,
         "variance_shares": shares,
         "variance_shares_prior": shares,
@@ -243,7 +250,7 @@ AGAINST = {
     "tradeoff": "emcee has not converged.",
     "measurement": "the fit is a misfit.",
     "drive": "the population fit is not reliable",
-    "population": "NOT converged: 4 ensembles; the integrals over",
+    "population": "NOT converged: 4 ensembles; the error of the records' likelihoods",
 }
 
 
