@@ -49,8 +49,7 @@ class Simulated(NamedTuple):
 def simulate(seed: int, number: int, fingers: int = FINGERS, noise: float = NOISE) -> Simulated:
     """Simulate population `number`."""
     rng = np.random.default_rng([seed, number])
-    score = scipy.stats.norm.ppf(0.975)
-    Rsc, Csc, Ci = (MEDIANS[name] * FACTORS[name] ** (rng.standard_normal() / score) for name in MEDIANS)
+    Rsc, Csc, Ci = draw_medians(rng)
     spread = SPREAD * np.abs(rng.standard_normal(2))
     r = 2.0 * rng.beta(2.0, 2.0) - 1.0
     root = spread[:, None] * np.array([[1.0, 0.0], [r, np.sqrt(1.0 - r**2)]])
@@ -69,6 +68,13 @@ def simulate(seed: int, number: int, fingers: int = FINGERS, noise: float = NOIS
     force = np.mean(settled[-1] ** 2) * (Ci * next_Csc / (Ci + next_Csc)) / (2.0 * THICKNESS)  # eqs. (3), (22)
     scene = fitact.Scene.from_dict({"drive": {"waveform": "triangle", "frequency": FREQUENCY}, "prior": PRIOR})
     return Simulated(records, scene, dict(zip(QUANTITIES, (Rsc, Csc, Ci, *spread, r, force), strict=True)))
+
+
+def draw_medians(rng: np.random.Generator) -> tuple[float, float, float]:
+    """Draw the medians of Rsc (ohm) and Csc (F), and Ci (F), from `PRIOR`."""
+    score = scipy.stats.norm.ppf(0.975)
+    Rsc, Csc, Ci = (MEDIANS[name] * FACTORS[name] ** (rng.standard_normal() / score) for name in MEDIANS)
+    return Rsc, Csc, Ci
 
 
 def vsc(Rsc: float, Csc: float, Ci: float, rng: np.random.Generator) -> np.ndarray:
@@ -98,15 +104,17 @@ def coverage(found: np.ndarray, share: float) -> tuple[float, float]:
     return covered, float((covered - share) / np.sqrt(share * (1.0 - share) / found.size))
 
 
-def show_coverage(rows: list[dict[str, Any]], quantities: Sequence[str]) -> bool:
+def show_coverage(
+    rows: list[dict[str, Any]], quantities: Sequence[str], intervals: Sequence[float] = INTERVALS
+) -> bool:
     """Print the coverage of each quantity; return whether all intervals cover, and no population was refused."""
     refused = [row["refused"] for row in rows if "refused" in row]
     answered = [row for row in rows if "refused" not in row]
     passed = not refused
-    print(f"{'':18}" + "".join(f"{f'{100 * share:.0f} %':>8}{'off by':>8}" for share in INTERVALS) + f"{'KS p':>8}")
+    print(f"{'':18}" + "".join(f"{f'{100 * share:.0f} %':>8}{'off by':>8}" for share in intervals) + f"{'KS p':>8}")
     for name in quantities:
         found = np.array([row["places"][name] for row in answered])
-        covered = [coverage(found, share) for share in INTERVALS]
+        covered = [coverage(found, share) for share in intervals]
         passed &= all(abs(off) <= SIGMAS for _, off in covered)
         cells = "".join(f"{100.0 * each:8.1f}{off:+8.1f}" for each, off in covered)
         print(f"{name:18}{cells}{scipy.stats.kstest(found, 'uniform').pvalue:8.3f}")

@@ -29,8 +29,9 @@ from fitact.populations.record_files import RecordFiles
 from fitact.populations.within_finger import WithinFinger
 from fitact.prior.prior import Prior
 from fitact.progress import track_progress
-from fitact.sampling.convergence import Convergence
+from fitact.sampling.convergence import Convergence, diagnose_weights
 from fitact.sampling.ensemble import Target, reject_nonfinite, run_ensembles
+from fitact.sampling.importance import draw_adaptively, systematic_resample
 from fitact.sampling.proposal import Proposal
 from fitact.scene.scene import Scene
 from fitact.scene.sections import DriveSection
@@ -138,20 +139,33 @@ def delete_chains(folder: str | os.PathLike[str]) -> None:
 def _sample_hierarchy(
     hierarchy: Hierarchy, fingerprint: str, seed: int, max_steps: int, chain_file: Path | None, progress: bool
 ) -> tuple[np.ndarray, Convergence]:
-    """Sample points (ensembles, about `draws`, coordinates), with their diagnostics."""
-    walkers, ensembles, draws = 128, 4, 2500
-    rows = hierarchy.targets.size * hierarchy.origin.size
-    log_prob = reject_nonfinite(BatchEvaluator(Hierarchy.log_prob, hierarchy, rows, walkers // 2))
+    """Sample points (ensembles, about `draws`, coordinates), with their diagnostics.
+
+    Weighted draws serve if enough of them are effective; otherwise emcee samples.
+    """
+    walkers, ensembles, draws, weighted_draws, least_effective = 128, 4, 2500, 60_000, 2000
+    rows, names = hierarchy.targets.size * hierarchy.origin.size, hierarchy.names
+    log_prob = reject_nonfinite(BatchEvaluator(Hierarchy.log_prob, hierarchy, rows, batch=256))
+    random = np.random.default_rng([seed, 10])
+    widening = np.array([1.15 if name.startswith("spread") else 1.0 for name in names])  # chosen by k-hat
+    found = draw_adaptively(log_prob, *laplace(hierarchy), random, weighted_draws, widening=widening)
+    if (chain_file is None or not chain_file.exists()) and np.isfinite(found.weighted.k_hat):
+        medians = log_medians(evaluate_parameters(hierarchy, found.points))
+        quantities = dict(zip(names, found.points.T, strict=True)) | medians
+        convergence = diagnose_weights("psis", found.weighted, quantities, ensembles * draws)
+        if convergence.converged and convergence.ess_min >= least_effective:
+            places = systematic_resample(found.weighted.weights, ensembles * draws, float(random.uniform()))
+            return found.points[random.permutation(places)].reshape(ensembles, draws, len(names)), convergence
     target = Target(
-        hierarchy.names,
+        names,
         log_prob,
-        Proposal.from_laplace(*laplace(hierarchy), log_prob),
+        Proposal.from_laplace(found.center, found.root, log_prob),
         lambda points, _: log_medians(evaluate_parameters(hierarchy, points)),
         fingerprint,
     )
     chain, convergence = run_ensembles(target, seed, walkers, ensembles, max_steps, chain_file, progress)
     points = chain.points[:, chain.thinning_slice(convergence.burn, draws)]
-    return points.reshape(ensembles, -1, len(hierarchy.names)), convergence
+    return points.reshape(ensembles, -1, len(names)), convergence
 
 
 def _prior(scene: Scene) -> Prior:

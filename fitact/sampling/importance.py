@@ -1,13 +1,15 @@
 """Independent draws around the fit, from its Laplace approximation or by importance sampling."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 
 from fitact.fitting import derived
 from fitact.fitting.result import Fit
-from fitact.sampling.convergence import diagnose_weights, pareto_smooth
+from fitact.sampling.convergence import ImportanceWeights, diagnose_weights, pareto_smooth
 from fitact.sampling.posterior import Posterior
-from fitact.sampling.proposal import LogProb, Proposal
+from fitact.sampling.proposal import LogProb, Proposal, draw_student_t, student_log_density
 
 
 def draw_around_fit(fit: Fit, level: str, log_prob: LogProb, seed: int) -> Posterior:
@@ -31,6 +33,48 @@ def draw_around_fit(fit: Fit, level: str, log_prob: LogProb, seed: int) -> Poste
         indices = rng.permutation(systematic_resample(weighted.weights, draws, float(rng.uniform())))
         points, values = points[indices], values[indices]
     return Posterior.from_draws(fit, points, values, convergence, seed)
+
+
+class AdaptedDraws(NamedTuple):
+    """Weighted draws from a Student-t that was fitted to the density."""
+
+    center: Float[np.ndarray, " n"]
+    root: Float[np.ndarray, "n n"]  # of its covariance, but for the tails
+    points: Float[np.ndarray, "draws n"]
+    weighted: ImportanceWeights
+
+
+def draw_adaptively(
+    log_prob: LogProb,
+    center: Float[np.ndarray, " n"],
+    root: Float[np.ndarray, "n n"],
+    random: np.random.Generator,
+    draws: int,
+    *,
+    widening: Float[np.ndarray, " n"],
+    rounds: int = 8,
+    pilot_draws: int = 4096,
+) -> AdaptedDraws:
+    """Fit a Student-t to a density by its weighted moments, round by round, and draw from it with weights.
+
+    Start with `center` and `root` of an approximation. A pilot with few effective draws is tempered. The last
+    distribution is wider by `widening`, more than 1 for coordinates with long tails.
+    """
+    for last in [*[False] * rounds, True]:
+        root = root * widening[:, None] if last else root
+        z = draw_student_t(random, draws if last else pilot_draws, center.size)
+        points = center + z @ root.T
+        log_weights = log_prob(points) - student_log_density(z)
+        weighted = pareto_smooth(log_weights)
+        if last:
+            break
+        while 1.0 / np.sum(np.square(weighted.weights)) < 10 * center.size and np.isfinite(weighted.k_hat):
+            log_weights = 0.5 * log_weights
+            weighted = pareto_smooth(log_weights)
+        center = weighted.weights @ points
+        away = points - center
+        root = np.linalg.cholesky((weighted.weights[:, None] * away).T @ away)
+    return AdaptedDraws(center, root, points, weighted)
 
 
 def tracked_quantities(fit: Fit, points: Float[np.ndarray, "chains draws n"], seed: int) -> dict[str, np.ndarray]:
