@@ -110,8 +110,8 @@ def population(
 ) -> None:
     """Estimate how fingers vary from records of several fingers, and predict the force on a new finger.
 
-    With --out, writes report.html, population.json, population.nc (the draws), population.svg and chain.h5 (to resume
-    sampling) into DIR.
+    With --out, writes report.html, population.json, population.nc (the draws) and population.svg into DIR, and
+    chain.h5, from which an interrupted run resumes, if the posterior is so far from normal that it needs emcee.
     """
     study = options.load_study(records, table, pattern)
     if table is not None and covariates is not None:

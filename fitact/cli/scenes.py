@@ -187,8 +187,7 @@ def drive(
 ) -> None:
     """Find the smallest drive that a given fraction of fingers feel, by waveform, frequency and insulator.
 
-    The threshold and your limits are stated in the scene. Writes report.html, drive.json and drive.svg into DIR; with
-    records also chain.h5, from which an interrupted run resumes.
+    The threshold and your limits are stated in the scene. Writes report.html, drive.json and drive.svg into DIR.
     """
     announce("designing a drive for", [scene])
     stated = fitact.Scene.load(scene)

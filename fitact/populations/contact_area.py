@@ -25,6 +25,7 @@ class ContactAreaTest(NamedTuple):
     p_value: float  # probability of a larger one if all have the same Ci; NaN for fewer than two such fingers
     log_sd: float  # standard deviation of log Ci between fingers beyond the standard errors (Hedges & Olkin 1985)
     tolerance: float  # log_sd that changes the force by no more than `[tolerance] force`
+    farthest: str = ""  # record whose Ci deviates most from the mean, in standard errors
     max_p_value: float = 0.01  # below which the fingers' own estimates disagree
 
     @classmethod
@@ -42,7 +43,8 @@ class ContactAreaTest(NamedTuple):
         chi_square = float(weight @ np.square(log_Ci - mean))
         excess = float(np.var(log_Ci, ddof=1) - np.mean(1.0 / weight))
         p_value = float(scipy.stats.chi2.sf(chi_square, count - 1))
-        return cls(assumption, count, chi_square, p_value, math.sqrt(max(excess, 0.0)), tolerance)
+        farthest = informative[int(np.argmax(weight * np.square(log_Ci - mean)))].source
+        return cls(assumption, count, chi_square, p_value, math.sqrt(max(excess, 0.0)), tolerance, farthest)
 
     @property
     def is_tested(self) -> bool:
@@ -69,9 +71,10 @@ class ContactAreaTest(NamedTuple):
             return f"{assumed}; these records cannot test this, because Vsc alone does not determine a finger's own Ci."
         scatter = f"their own Ci differ by {format_percent(self.log_sd)} (1 sd) beyond their standard errors"
         if self.disagrees:
+            chance = f"p = {self.p_value:.2g}" if self.p_value > 1e-9 else "p < 1e-9"
             return (
-                f'[population] contact_area = "common" is contradicted by the records: {scatter}, which is significant'
-                f' (p = {self.p_value:.2g}); write contact_area = "varies"'
+                f'[population] contact_area = "common" is contradicted by the records: {scatter} ({chance}),'
+                f' {self.farthest} most; write contact_area = "varies", or leave that record out'
             )
         return f"{assumed}; the records agree with it: {scatter}."
 

@@ -63,7 +63,7 @@ def population(
     Csc are correlated. All share the panel's Ci. With the scene's `[population] contact_area = "varies"`, Ci, Csc and
     1/Rsc scale with each touch's own log-normal contact area, which has effects at the same levels. Medians and Ci have
     the scene's prior, log-standard deviations a half-normal prior of scale 0.5, and a correlation r has the density 3/4
-    (1 - r^2). The effects are integrated out.
+    (1 - r^2). The effects are integrated out; the rest is sampled by weighted draws, or by emcee where these fail.
 
     Args:
         records: records, spectra or tracks on one panel, or sequences of records that are fitted jointly; they are read
@@ -75,9 +75,9 @@ def population(
             and of the area if it varies, change linearly with each, with a normal prior of scale 0.5 per standard
             deviation of the covariate.
         at: covariates of the next finger; default: their mean.
-        folder: folder for the chain; a chain of the same records there is resumed.
+        folder: folder for emcee's chain, if it is needed; a chain of the same records there is resumed.
         seed: the same seed gives the same draws, whether or not sampling was interrupted.
-        max_steps: largest number of steps per ensemble, after which the result is marked as not converged.
+        max_steps: largest number of emcee's steps, after which the result is marked as not converged.
         progress: whether to report on standard error.
 
     Ctrl-C ends the sampling; the result is then marked as not converged.
@@ -122,7 +122,7 @@ def population(
         hierarchy = Hierarchy.from_fingers(averages, nesting, medians, standardized.z_scores, area_varies=area_varies)
         chain_file = None if folder is None else Path(folder) / _CHAIN_FILE
         fingerprint = _fingerprint(averages, nesting, standardized, scene, seed)
-        points, convergence = _sample_hierarchy(hierarchy, fingerprint, seed, max_steps, chain_file, progress)
+        points, convergence = sample_hierarchy(hierarchy, fingerprint, seed, max_steps, chain_file, progress)
         top = nesting.levels[0].unit_numbers
         points, error = correct_draws(hierarchy, averages, top, points, seed, progress)
     return Population(
@@ -136,7 +136,7 @@ def delete_chains(folder: str | os.PathLike[str]) -> None:
     (Path(folder) / _CHAIN_FILE).unlink(missing_ok=True)
 
 
-def _sample_hierarchy(
+def sample_hierarchy(
     hierarchy: Hierarchy, fingerprint: str, seed: int, max_steps: int, chain_file: Path | None, progress: bool
 ) -> tuple[np.ndarray, Convergence]:
     """Sample points (ensembles, about `draws`, coordinates), with their diagnostics.

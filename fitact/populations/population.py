@@ -126,7 +126,7 @@ class Population(Display):
             else f"the uncertainty of that law and of {thickness}"
         )
         sentences = [
-            *self.nesting.omitted,
+            *self._nesting_sentences,
             f"the force is computed with [force] model = '{self.scene.force.model}', not measured; its intervals"
             f" exclude {excluded}",
         ]
@@ -145,6 +145,13 @@ class Population(Display):
         if self.within is not None:
             sentences += self.within.describe_assumptions(len(self.fingers))
         return (*sentences, *self._prior_sentences, self.contact_area.sentence)
+
+    @property
+    def _nesting_sentences(self) -> tuple[str, ...]:
+        """Sentences on levels that are left out."""
+        if self.nesting.omitted or self.nesting.levels[0].name != "finger" or len(self.nesting.levels) > 1:
+            return self.nesting.omitted
+        return ("each record counts as another finger; --table or --pattern (labels) state people and repetitions",)
 
     @property
     def _prior_sentences(self) -> Iterator[str]:

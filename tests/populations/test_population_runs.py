@@ -1,5 +1,6 @@
 """Runs of populations as labs make them: interrupted and resumed, long records, areas that vary, covariates."""
 
+import math
 import weakref
 from collections.abc import Sequence
 from typing import Any
@@ -9,8 +10,10 @@ import numpy as np
 import pytest
 
 import fitact
+from fitact.populations import fit_population
 from fitact.populations.contact_area import ContactAreaTest
 from fitact.populations.finger import Finger
+from fitact.sampling.importance import AdaptedDraws, draw_adaptively
 from tests.calibration import AMPLITUDE, PER_PERIOD, wave
 from tests.population_calibration import FREQUENCY, NOISE, simulate, vsc
 
@@ -22,9 +25,32 @@ def few() -> Any:
     return simulate(SEED, 0, fingers=6)
 
 
+def fail_weights(*arguments: Any, **options: Any) -> AdaptedDraws:
+    """Draw as a population does, with weights that are not to be relied on."""
+    found = draw_adaptively(*arguments, **options)
+    return found._replace(weighted=found.weighted._replace(k_hat=math.inf))
+
+
 @pytest.mark.slow
-def test_a_population_goes_on_where_it_stopped(few, tmp_path):
+def test_emcee_goes_on_where_weighted_draws_fail(few, monkeypatch):
+    """Means and standard deviations agree within four standard errors."""
+    weighted = fitact.population(few.records, few.scene, seed=1, progress=False)
+    assert weighted.convergence.level == "psis"
+    monkeypatch.setattr(fit_population, "draw_adaptively", fail_weights)
+    chain = fitact.population(few.records, few.scene, seed=1, progress=False)
+    assert chain.convergence.level == "emcee"
+    assert chain.trusted
+    effective = 1.0 / (1.0 / weighted.convergence.ess_min + 1.0 / chain.convergence.ess_min)
+    for name, values in weighted.parameters().items():
+        mean, sd = np.mean(values), np.std(values)
+        assert np.mean(chain.parameters()[name]) == pytest.approx(mean, abs=4.0 * sd / np.sqrt(effective)), name
+        assert np.std(chain.parameters()[name]) == pytest.approx(sd, rel=0.1), name
+
+
+@pytest.mark.slow
+def test_a_population_goes_on_where_it_stopped(few, tmp_path, monkeypatch):
     """To the draws of an undisturbed run; a chain of another seed is refused."""
+    monkeypatch.setattr(fit_population, "draw_adaptively", fail_weights)
     undisturbed = fitact.population(few.records, few.scene, seed=1, progress=False)
     stopped = fitact.population(few.records, few.scene, seed=1, folder=tmp_path, max_steps=30, progress=False)
     assert not stopped.trusted
@@ -86,7 +112,6 @@ def test_slopes_of_a_covariate_and_fingers_at_one_are_covered():
         records, scene, covariates={"moisture": moisture}, at={"moisture": 8.0}, seed=1, progress=False
     )
     assert found.trusted
-    assert found.convergence.tau_max < 6.0
     draws, new = found.parameters(), found.new_fingers()
     for name, slope, sd in zip(("Rsc", "Csc"), slopes, spread, strict=True):
         low, high = np.quantile(draws[f"slope_{name}_moisture"], [0.005, 0.995])
