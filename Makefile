@@ -36,7 +36,7 @@ test-slow-quick: env
 
 # make notebooks   run the notebooks; executed copies in out/notebooks
 notebooks: env
-	$(PY) tools/run_notebooks.py notebooks/[1-5]_*.py
+	$(PY) tools/run_notebooks.py notebooks/[1-57]_*.py
 
 # make peers   the notebook on other fitters, which run in an environment of their own, out/peers
 peers: env

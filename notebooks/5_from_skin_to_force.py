@@ -38,8 +38,8 @@ truth = json.loads((FOLDER / "truth.json").read_text())
 # ## The population
 #
 # log Rsc and log Csc are normal over fingers, with a correlation. Ci is assumed common to all fingers, which means that
-# all contact areas are equal; `[population] contact_area = "varies"` drops this assumption. emcee samples the
-# population parameters; the parameters of each finger are integrated out.
+# all contact areas are equal; `[population] contact_area = "varies"` drops this assumption. The population
+# parameters are sampled; the parameters of each finger are integrated out.
 
 # %%
 people = fitact.population(records, scene, seed=1, progress=False)

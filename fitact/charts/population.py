@@ -59,7 +59,8 @@ def _draw_skin(axes: Axes, tree: Any, content: dict[str, Any], max_fingers: int 
         bars = widths_Csc[:, members], widths_Rsc[:, members]
         axes.errorbar(Rsc[members], Csc[members], *bars, fmt="o", ms=4, color=color, label=name)
     axes.set(xscale="log", yscale="log", xlabel="Rsc", ylabel="Csc", title="Fingers")
-    log_ticks(axes.xaxis, "Ω")
+    low, high = axes.get_xlim()
+    log_ticks(axes.xaxis, "Ω", (1.0,) if high > 100.0 * low else (1.0, 2.0, 5.0))
     log_ticks(axes.yaxis, "F")
     axes.legend(markerscale=2, fontsize=9, ncols=2)
 

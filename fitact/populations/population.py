@@ -157,6 +157,7 @@ class Population(Display):
     def _prior_sentences(self) -> Iterator[str]:
         """Sentences on spreads between few units that depend on their prior."""
         names, relevant = self.hierarchy.components, 0.3  # of the standard deviation
+        where = " at the median area" if self.hierarchy.area_varies else ""
         for place, level in enumerate(self.nesting.levels):
             for component, name in enumerate(names):
                 found = self._parameter_draws.log_sd[..., place, component]
@@ -164,8 +165,8 @@ class Population(Display):
                 if high - low > relevant * float(np.std(found)):
                     units = f"{len(level.units)} {UNIT_NAMES[level.name][1]}"
                     yield (
-                        f"with only {units}, the spread of {_quantity(name)} between them depends on its prior: its"
-                        f" median is {low:.2g} to {high:.2g} with half to twice the scale"
+                        f"with {units}, the spread of {_quantity(name)}{where * (name in SKIN)} between them depends on"
+                        f" its prior: its median is {low:.2g} to {high:.2g} with half to twice the scale"
                     )
 
     def _median_with_prior_scale(self, level: int, component: int, scale: float) -> float:
@@ -372,8 +373,8 @@ class Population(Display):
         law["covariates"] = {
             name: {"mean": float(mean), "sd": float(sd), "next_finger": float(mean + at * sd)}
             | {
-                each: {"slope": summary.summarize_draws("slope", draws[f"slope_{each}_{name}"])}
-                for each in ([*SKIN, "area"] if self.hierarchy.area_varies else SKIN)
+                each: {"slope": summary.summarize_draws("slope", draws[f"slope_{component}_{name}"])}
+                for each, component in zip(self.hierarchy.components, (*SKIN, "area"), strict=False)
             }
             for name, mean, sd, at in zip(
                 self.covariates.names, self.covariates.mean, self.covariates.sd, self.at, strict=True
@@ -503,9 +504,9 @@ def population_table(content: dict[str, Any]) -> tuple[tuple[str, ...], ...]:
     if AREA in law and len(levels) < 2:
         shown["contact area, log_sd"] = law[AREA]["log_sd"]
     shown |= {
-        f"{each}, slope in {name}": x[each]["slope"]
+        f"{_quantity(each)}, slope in {name}": x[each]["slope"]
         for name, x in law["covariates"].items()
-        for each in (*SKIN, "area")
+        for each in (*SKIN, AREA)
         if each in x
     }
     if len(levels) > 1:

@@ -171,7 +171,7 @@ def test_integral_over_a_finger_is_that_of_quadrature():
             return integrated.log_norm - 0.5 * coefficients @ integrated.square @ coefficients, law
 
         found, laws = jax.tree.map(np.asarray, jax.jit(jax.vmap(normal))(points))
-        found = found + log_weights(hierarchy, [finger], np.zeros(1, int), points, 2**11, [1], progress=False)
+        found = found + log_weights(hierarchy, [finger], np.zeros(1, int), points, 2**11, [1], [0], progress=False)[0]
     expected = []
     for median, sd, r, c in zip(laws.mean, laws.log_sd[:, 0], laws.correlation[:, 0], laws.log_Ci, strict=True):
         skin = np.broadcast_arrays(np.log(g)[:, None] + np.log(b) - c, np.log(1.0 / g - 2.0)[:, None] + c)

@@ -1,8 +1,12 @@
 """Runs of populations as labs make them: interrupted and resumed, long records, areas that vary, covariates."""
 
+import json
 import math
+import subprocess
+import sys
 import weakref
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -18,6 +22,7 @@ from tests.calibration import AMPLITUDE, PER_PERIOD, wave
 from tests.population_calibration import FREQUENCY, NOISE, simulate, vsc
 
 SEED = 3
+STUDY = Path(__file__).parents[2] / "data_synth" / "records" / "study"
 
 
 @pytest.fixture(scope="module")
@@ -190,3 +195,73 @@ def record(skin: np.ndarray, Ci: float, number: int, rng: np.random.Generator, c
         **channels,
         source=f"finger {number}",
     )
+
+
+@pytest.fixture(scope="module")
+def study_folder(tmp_path_factory) -> Path:
+    """The output of the command for the shipped study: 6 people of 3 touches, with noise, rounding and skew."""
+    folder = tmp_path_factory.mktemp("study") / "people"
+    command = [sys.executable, "-c", "from fitact.cli import main; main()", "population"]
+    command += ["--table", str(STUDY / "study.csv"), "--scene", str(STUDY.with_suffix(".toml")), "--seed", "1"]
+    done = subprocess.run([*command, "--out", str(folder)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "between people, Rsc, log_sd" in done.stdout
+    assert "touch of a new person, force_mean" in done.stdout
+    return folder
+
+
+@pytest.mark.slow
+def test_a_study_tells_people_and_touches_apart(study_folder):
+    """Each level's spread, and each person's next touch: the true values within 99 %."""
+    found = json.loads((study_folder / "population.json").read_text())
+    truth = json.loads((STUDY / "truth.json").read_text())
+    values = np.log([[each[name] for name in ("Rsc", "Csc", "Ci")] for each in truth])
+    by_person = values.reshape(6, 3, 3)
+    assert [(level["level"], level["units"]) for level in found["levels"]] == [("person", 6), ("repetition", 18)]
+    people, touches = found["levels"]
+    within = by_person.var(axis=1, ddof=1).mean(axis=0)
+    between = by_person.mean(axis=1).var(axis=0, ddof=1) - within / 3.0
+    for i, name in enumerate(("Rsc", "Csc")):
+        # of the drawn values: a chi-square's 95 % of 12 and of 5 degrees of freedom are factors of 1.9 and 3.9 apart
+        assert touches["log_sd"][name]["q025"] < np.sqrt(within[i]) < touches["log_sd"][name]["q975"]
+        assert people["log_sd"][name]["q025"] < np.sqrt(between[i]) < people["log_sd"][name]["q975"]
+        assert people["intraclass_correlation"][name]["q025"] > 0.5
+        assert found["population"][name]["median"]["q025"] < np.exp(values[:, i].mean())
+        assert found["population"][name]["median"]["q975"] > np.exp(values[:, i].mean())
+    assert set(found["forecasts"]) == {"person", *(f"P{i}" for i in range(1, 7))}
+    for person, mean in zip(range(1, 7), by_person.mean(axis=1), strict=True):
+        forecast = found["forecasts"][f"P{person}"]["Rsc"]
+        assert forecast["q25"] < np.exp(mean[0]) < forecast["q75"]
+        assert np.log(forecast["q975"] / forecast["q025"]) < 6.0 * np.sqrt(within[0])
+    parts = found["new_finger"]["force_mean"]["variance"]
+    assert sum(parts["levels"].values()) == pytest.approx(parts["people"])
+    assert parts["levels"]["person"] > parts["levels"]["repetition"] > 0.0
+    now, *larger = found["next_studies"]
+    assert (now["units"], now["repetitions"], now["records"]) == (6, 3, 18)
+    four_times = next(each for each in larger if each["units"] == 24)
+    assert four_times["median_u"] == pytest.approx(0.5 * now["median_u"])  # people halve it, not repetitions
+    assert all(each["median_u"] > 0.9 * now["median_u"] for each in larger if each["units"] == 6)
+
+
+@pytest.mark.slow
+def test_a_drive_for_the_study_needs_no_records(study_folder):
+    """Read from the folder; some touches need more than the typical one, and all people more than most."""
+    scene = fitact.Scene.from_dict({"perception": {"threshold_force": "20 uN"}})
+    design = fitact.design_drive(scene, study_folder, 0.9, touches=0.9)
+    assert design.question.startswith("To be felt by 90 % of people in 90 % of touches")
+    amplitude = design.options["sine"].assured
+    assert fitact.design_drive(scene, study_folder, 0.9, touches=0.5).options["sine"].assured < amplitude
+    assert fitact.design_drive(scene, study_folder, 0.5, touches=0.9).options["sine"].assured < amplitude
+    with pytest.raises(fitact.InputError, match="holds no complete population"):
+        fitact.design_drive(scene, study_folder.parent)
+
+
+@pytest.mark.slow
+def test_one_area_is_refused_where_records_contradict_it():
+    study = fitact.Study.from_pattern("P{person}_r{repetition}.csv.gz", sorted(STUDY.glob("P[12]_*.csv.gz")))
+    scene = fitact.Scene.load(STUDY.with_suffix(".toml")).model_dump(exclude_unset=True)
+    common = fitact.Scene.from_dict(scene | {"population": {"contact_area": "common"}})
+    with pytest.raises(
+        fitact.InputError, match=r"contact_area = \"common\" is contradicted .* by 1\d % .*P2_r3.csv.gz most"
+    ):
+        fitact.population(study, common, progress=False)
