@@ -251,6 +251,19 @@ def test_population_is_drawn_in_four_panels():
     ]  # fmt: skip
 
 
+def test_levels_of_a_population_have_panels_of_their_own():
+    """Each touch beside those of its person, and two parts of each bar."""
+    figure = draw_population(*test_pages.population_with_levels(), make=plt.figure)
+    panels = {each.get_title(): each for each in figure.axes if each.get_title()}
+    assert list(panels) == [
+        "Fingers", "Force on different fingers", "Touches", "Levels", "The next finger in time", "Sources of variance",
+    ]  # fmt: skip
+    assert [label.get_text() for label in panels["Touches"].get_xticklabels()] == ["Ann", "Ben"]
+    widths = np.reshape([bar.get_width() for bar in panels["Levels"].patches], (2, -1))
+    np.testing.assert_allclose(widths.sum(axis=0), 1.0)
+    assert widths[0, -1] == pytest.approx(0.35**2 / (0.35**2 + 0.06**2))  # Rsc, the uppermost
+
+
 def test_data_frames_hold_the_numbers(finger_fit, finger_posterior, track, spectrum):
     record = finger_fit.record.to_dataframe()
     assert list(record) == ["time_s", "V_V", "Vsc_V"]

@@ -86,7 +86,7 @@ class Study(Display):
             InputError: the table cannot be read, a file is missing or named twice, a cell is empty, a covariate has
                 neither numbers nor two words, or two rows have the same labels with the same repetition.
         """
-        table, folder = _Table.from_csv(path), Path(path).parent
+        table, folder = _Rows.from_csv(path), Path(path).parent
         records, lines = [], dict[str, str]()
         for place, text in zip(table.places, table.columns[_RECORD], strict=True):
             if not text:
@@ -124,10 +124,10 @@ class Study(Display):
                 )
             rows.append(found.groups())
         columns = {name: [row[i] for row in rows] for i, name in enumerate(names)}
-        return cls._from_columns(_Table(columns, [str(path) for path in paths], pattern), paths)
+        return cls._from_columns(_Rows(columns, [str(path) for path in paths], pattern), paths)
 
     @classmethod
-    def _from_columns(cls, table: "_Table", records: Sequence[Path]) -> Self:
+    def _from_columns(cls, table: "_Rows", records: Sequence[Path]) -> Self:
         labels = {name: tuple(table.columns[name]) for name in LEVELS if name in table.columns}
         nest_levels(labels, len(records), table.places)  # raises InputError
         covariates, codes = {}, {}
@@ -266,7 +266,7 @@ def is_study(path: str | os.PathLike[str]) -> bool:
         return False
 
 
-class _Table(NamedTuple):
+class _Rows(NamedTuple):
     """Columns of text; `places` names each row in messages."""
 
     columns: Mapping[str, Sequence[str]]

@@ -9,9 +9,9 @@ import scipy
 from jaxtyping import Float
 
 from fitact.populations.finger import SHARED_PARAMETER, SKIN
-from fitact.populations.population import UNIT_NAMES
 from fitact.populations.population_draws import PopulationDraws
 from fitact.populations.population_parameters import PopulationParameters
+from fitact.populations.population_text import UNIT_NAMES
 from fitact.scene.prior_predictive import sample_prior
 from fitact.scene.scene import Scene
 

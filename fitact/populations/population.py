@@ -3,9 +3,8 @@
 import dataclasses
 import functools
 import importlib.metadata
-import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -29,6 +28,16 @@ from fitact.populations.next_finger import (
     redrawn_variance_fraction,
 )
 from fitact.populations.population_parameters import PopulationParameters
+from fitact.populations.population_text import (
+    SHARES_LEGEND,
+    UNIT_NAMES,
+    VARIANCE_QUANTITIES,
+    describe_factor,
+    describe_units,
+    population_table,
+    study_table,
+    variance_sentences,
+)
 from fitact.populations.repeatability import LevelVariances
 from fitact.populations.sobol import SobolIndices, variance_shares
 from fitact.populations.within_finger import WithinFinger
@@ -36,18 +45,10 @@ from fitact.sampling.convergence import Convergence
 from fitact.sampling.posterior import convert_to_arviz
 from fitact.scene.scene import Scene
 from fitact.tables import Display, align_table, join_lines, to_dataframe, to_dataset, to_datatree
-from fitact.units import choose_prefixed_unit, format_engineering, format_percent, quantity_unit
+from fitact.units import format_engineering, quantity_unit
 
 QUANTILES = tuple(summary.PROBABILITIES.values())  # of the force in time
-VARIANCE_QUANTITIES = ("force_mean", "force_peak")  # quantities with Sobol indices
 ADVICE = "use track"  # in the message of a fit that shows a finger that changes
-UNIT_NAMES = {  # of levels, one and several
-    "person": ("person", "people"),
-    "finger": ("finger", "fingers"),
-    "session": ("session", "sessions"),
-    "repetition": ("touch", "touches"),
-}
-SHARES_LEGEND = "Parameters: Sobol indices, first-order (total)."
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -164,9 +165,10 @@ class Population(Display):
                 low, high = (self._median_with_prior_scale(place, component, scale) for scale in (0.5, 2.0))
                 if high - low > relevant * float(np.std(found)):
                     units = f"{len(level.units)} {UNIT_NAMES[level.name][1]}"
+                    what = f"{describe_factor(name)}{where * (name in SKIN)}"
                     yield (
-                        f"with {units}, the spread of {_quantity(name)}{where * (name in SKIN)} between them depends on"
-                        f" its prior: its median is {low:.2g} to {high:.2g} with half to twice the scale"
+                        f"with {units}, the spread of {what} between them depends on its prior: its median is"
+                        f" {low:.2g} to {high:.2g} with half to twice the scale"
                     )
 
     def _median_with_prior_scale(self, level: int, component: int, scale: float) -> float:
@@ -491,120 +493,6 @@ class Population(Display):
         """Write `to_datatree()` as NetCDF."""
         with atomic_write(path) as temporary:
             self.to_datatree().to_netcdf(temporary, engine="h5netcdf")
-
-
-def population_table(content: dict[str, Any]) -> tuple[tuple[str, ...], ...]:
-    """Return titles, then rows of the population and the next finger from population.json, for people."""
-    law, new, levels = content["population"], content["new_finger"], content["levels"]
-    next_one = describe_next_touch(levels)
-    shown = {f"{name}, median": law[name]["median"] for name in SKIN}
-    if len(levels) < 2:
-        shown |= {f"{name}, log_sd": law[name]["log_sd"] for name in SKIN}
-    shown |= {name: law[name] for name in (SHARED_PARAMETER, "correlation")}
-    if AREA in law and len(levels) < 2:
-        shown["contact area, log_sd"] = law[AREA]["log_sd"]
-    shown |= {
-        f"{_quantity(each)}, slope in {name}": x[each]["slope"]
-        for name, x in law["covariates"].items()
-        for each in (*SKIN, AREA)
-        if each in x
-    }
-    if len(levels) > 1:
-        for level in levels:
-            between = f"between {UNIT_NAMES[level['level']][1]}"
-            shown |= {f"{between}, {_quantity(name)}, log_sd": s for name, s in level["log_sd"].items()}
-        for level in levels[:-1]:
-            same = f"touches of one {UNIT_NAMES[level['level']][0]}"
-            found = level["intraclass_correlation"]
-            shown |= {f"{same}, {name}, correlation": found[name] for name in (*SKIN, "force_mean")}
-    within = content.get("within_finger", {})
-    shown |= {f"within a finger, {name}, log_sd": each["log_sd"] for name, each in within.items()}
-    shown |= {f"{next_one}, {name}": new[name] for name in NAMES}
-    rows = [(name, *format_quantiles(s)) for name, s in shown.items()]
-    if "friction" not in content["scene"]:  # two defaults give it, so more digits would mislead
-        name, s = f"{next_one}, friction_mean", new["friction_mean"]
-        cells = (format_engineering(float(f"{s[key]:.2g}"), s["unit"], 3) for key in ("q50", "q025", "q975"))
-        rows = [(name, *cells) if row[0] == name else row for row in rows]
-    if AREA not in law:
-        rows.insert(len(rows) - len(NAMES), ("contact area", "common", "(assumed)", ""))
-    return (describe_units(levels), "median", "2.5 % quantile", "97.5 % quantile"), *rows
-
-
-def describe_units(levels: Sequence[Mapping[str, Any]]) -> str:
-    """Return e.g. "8 fingers", or "18 touches of 6 people", from the entry `levels` of population.json."""
-    counts = [f"{level['units']} {UNIT_NAMES[level['level']][1]}" for level in levels]
-    return counts[0] if len(counts) == 1 else f"{counts[-1]} of {counts[0]}"
-
-
-def describe_next_touch(levels: Sequence[Mapping[str, Any]]) -> str:
-    """Return e.g. "next finger", or "touch of a new person"."""
-    top = UNIT_NAMES[levels[0]["level"]][0]
-    return f"next {top}" if len(levels) == 1 else f"touch of a new {top}"
-
-
-def _quantity(name: str) -> str:
-    return name.replace("contact_area", "contact area")
-
-
-def study_table(content: dict[str, Any]) -> tuple[tuple[str, ...], ...]:
-    """Return titles, then rows of the present and larger studies from population.json; none for a single level."""
-    entries, levels = content["next_studies"], content["levels"]
-    if not entries:
-        return ()
-    units, now = UNIT_NAMES[levels[0]["level"]][1], entries[0]
-    rows = [
-        (
-            str(each["units"]),
-            str(each["repetitions"]),
-            str(each["records"]),
-            *(f"{format_percent(each[key])} ({each[key] / now[key]:.2f})" for key in ("median_u", "log_sd_u")),
-        )
-        for each in entries
-    ]
-    titles = units, "repetitions", "records", "u of the median force", f"u of the spread between {units}"
-    return titles, *rows
-
-
-def format_quantiles(s: dict[str, Any], keys: Sequence[str] = ("q50", "q025", "q975")) -> list[str]:
-    """Format quantiles of a summary to the place of the second digit of its standard deviation, at most 4 digits."""
-    median, sd, unit = float(s["q50"]), float(s["sd"]), s["unit"]
-    if not 0.0 < sd <= 0.5 * abs(median):
-        return [format_engineering(float(f"{s[key]:.2g}"), unit, 3) for key in keys]
-    digits = min(4, math.floor(math.log10(abs(median))) - math.floor(math.log10(float(f"{sd:.1e}"))) + 2)
-    size, symbol = choose_prefixed_unit(median, unit)
-    places = max(0, digits - 1 - math.floor(math.log10(abs(median) / size)))
-    return [f"{float(s[key]) / size:.{places}f} {symbol}".rstrip() for key in keys]
-
-
-def format_variance_part(fraction: float) -> str:
-    """Format a part of a variance in whole per cent, and a smaller one with two digits."""
-    return format_percent(fraction) if 0.0 < fraction < 0.01 else f"{100.0 * fraction:.0f} %"
-
-
-def variance_sentences(content: dict[str, Any]) -> tuple[str, ...]:
-    """Return sentences on the sources of variance of the next finger's force, from population.json."""
-    sentences = []
-    for name in VARIANCE_QUANTITIES:
-        variance = content["new_finger"][name]["variance"]
-        sources = {"within_finger": "from changes within a finger"}
-        if "levels" in variance:
-            variance = variance | variance["levels"]
-            sources |= {
-                level: f"from differences between {UNIT_NAMES[level][1]}" for level in reversed(variance["levels"])
-            }
-        else:
-            key = "between_fingers" if "within_finger" in variance else "people"
-            sources[key] = f"from differences between {UNIT_NAMES[content['levels'][0]['level']][1]}"
-        sources["ignorance"] = "from uncertainty of the population parameters"
-        sizes = ", ".join(
-            f"{format_variance_part(variance[part])} {text}" for part, text in sources.items() if part in variance
-        )
-        parts = (
-            f"{factor} {round(100.0 * share['first'])} % ({round(100.0 * share['total'])} %)"
-            for factor, share in content["variance_shares"][name].items()
-        )
-        sentences.append(f"Variance of {name}: {sizes}; Sobol indices {', '.join(parts)}")
-    return tuple(sentences)
 
 
 @jit

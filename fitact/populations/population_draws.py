@@ -10,8 +10,9 @@ import numpy as np
 from fitact.errors import InputError
 from fitact.files import read_datatree
 from fitact.populations.finger import SHARED_PARAMETER, SKIN
-from fitact.populations.population import Population, describe_units, draw_parameters
+from fitact.populations.population import Population, draw_parameters
 from fitact.populations.population_parameters import PopulationParameters
+from fitact.populations.population_text import describe_units
 from fitact.summary import TRUSTED_RESULTS
 
 

@@ -56,7 +56,7 @@ def _frame(design: DriveDesign) -> PageSummary:
         findings["Which voltage to set"] = f"{_VOLTAGES}{_INTERVALS * design.people.has_separate_uncertainty}."
         findings |= {f"{name[0].upper()}{name[1:]}": f"{answer}." for name, answer in smallest}
     return PageSummary(
-        title=f"The smallest drive that {100.0 * design.share:g} % of fingers feel",
+        title=f"The smallest drive that {100.0 * design.share:g} % of {design.people.unit} feel",
         subject=f"Peak-to-peak amplitude, power, current and insulator voltage of each waveform at"
         f" {format_engineering(design.options[design.scene_waveform].frequency, 'Hz', 3)}, at other frequencies and on"
         " other insulators.",

@@ -23,7 +23,7 @@ from fitact.errors import InputError
 from fitact.files import read_datatree
 from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.populations.exact_likelihood import MAX_INTEGRATION_ERROR
-from fitact.populations.population import (
+from fitact.populations.population_text import (
     SHARES_LEGEND,
     UNIT_NAMES,
     VARIANCE_QUANTITIES,
@@ -142,7 +142,7 @@ def _frame(content: dict[str, Any]) -> PageSummary:
         subject=f"Differences between {several}, estimated from records of {units} on one panel, and the force on the"
         f" {next_touch}.",
         trusted=content["trusted"],
-        verdict=f"Reliable: the chain has converged, and {accuracy}"
+        verdict=f"Reliable: the posterior is sampled well enough, and {accuracy}"
         if content["trusted"]
         else f"{content['convergence']['sentence']}; {accuracy} (at most {MAX_INTEGRATION_ERROR:g} are accepted).",
         findings={

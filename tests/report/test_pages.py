@@ -186,6 +186,39 @@ def population(trusted: bool = True) -> tuple[xr.DataTree, dict[str, Any]]:
     return xr.DataTree.from_dict(groups), content
 
 
+def population_with_levels() -> tuple[xr.DataTree, dict[str, Any]]:
+    """Return the population of three touches of two people."""
+    tree, content = population()
+
+    def level(name: str, units: int, sds: dict[str, float]) -> dict[str, Any]:
+        return {"level": name, "units": units, "log_sd": {key: summary(sd, "1") for key, sd in sds.items()}}
+
+    people = level("person", 2, {"Rsc": 0.35, "Csc": 0.3, "g": 0.3, "b": 0.4, "force_mean": 0.6})
+    people["intraclass_correlation"] = {name: summary(0.9, "1") for name in people["log_sd"]}
+    touches = level("repetition", 3, {name: 0.06 for name in people["log_sd"]})
+    forecasts = {
+        name: {key: summary(Rsc if key == "Rsc" else s["q50"], s["unit"]) for key, s in content["new_finger"].items()}
+        for name, Rsc in (("person", 120e3), ("Ann", 140e3), ("Ben", 100e3))
+    }
+    now = {"units": 2, "repetitions": 2, "records": 3, "median_u": 0.4, "log_sd_u": 0.25}
+    larger = {"units": 4, "repetitions": 2, "records": 8, "median_u": 0.2, "log_sd_u": 0.15}
+    fingers = [
+        finger | {"units": {"person": person, "repetition": f"{person}, {number}"}}
+        for finger, person, number in zip(
+            content["fingers"][:1] + content["fingers"], ("Ann", "Ann", "Ben"), "121", strict=True
+        )
+    ]
+    parts = {"variance": {"people": 0.875, "ignorance": 0.125, "levels": {"person": 0.8, "repetition": 0.075}}}
+    new = {name: s | parts for name, s in content["new_finger"].items()}
+    return tree, content | {
+        "levels": [people, touches],
+        "forecasts": forecasts,
+        "next_studies": [now, larger],
+        "fingers": fingers,
+        "new_finger": new,
+    }
+
+
 WRITE: dict[str, Callable[[Path, bool], None]] = {
     "plan": lambda path, _: write_plan_page(path, plan(), ORIGIN),
     "tradeoff": lambda path, trusted: write_tradeoff_page(path, tradeoff(trusted), ORIGIN),
@@ -233,7 +266,7 @@ VERDICTS = {
     "tradeoff": "Fastest methods on the Pareto fronts: best answer (answer), best response (response)",
     "measurement": "Largest gain per effort: series resistor, done well; uncertainty of the mean force from ± 5 %",
     "drive": "Set a sine of 250 V amplitude (500 V peak to peak) at 100 Hz: with 95 % probability, at least 95 %",
-    "population": "Reliable: the chain has converged",
+    "population": "Reliable: the posterior is sampled well enough",
 }
 
 
@@ -334,6 +367,27 @@ def test_a_drive_that_no_limit_allows(tmp_path: Path):
     )
     text = words(Page((tmp_path / "drive.html").read_text()))
     assert text.index("No amplitude is recommended, because no waveform meets") < text.index("What counts as felt")
+
+
+def test_levels_are_on_the_page(tmp_path: Path):
+    """Two people of whom one was recorded twice: groups, spreads, forecasts and larger studies."""
+    tree, content = population_with_levels()
+    write_population_page(tmp_path / "report.html", tree, content)
+    text = words(Page((tmp_path / "report.html").read_text()))
+    shown = (
+        "Population: 3 touches of 2 people",
+        "between people, force_mean, log_sd 0.60",
+        "between touches, Rsc, log_sd 0.060",
+        "touches of one person, Rsc, correlation 0.90",
+        "a new person, typical 120 kΩ",
+        "Ann, next touch 140 kΩ",
+        "people repetitions records u of the median force u of the spread between people",
+        "4 2 8 20 % (0.50) 15 % (0.60)",
+        "touch of a new person 2.5 %",
+        "between touches between people parameters",
+        "8 % 80 % 12 %",
+    )
+    assert [part for part in shown if part not in text] == []
 
 
 def test_a_population_is_read_again(tmp_path: Path):
