@@ -257,37 +257,42 @@ class Population(Display):
         """Draws of the values typical of a new unit of the top level, and of the next touch of each known finger.
 
         The first has the top level's name, with no effects of the levels below; the others are names of people or
-        fingers. There are none if the records have a single level.
+        fingers, with their own covariates as far as these do not differ between its records. There are none if the
+        records have a single level.
         """
         levels = self.nesting.levels
         if len(levels) < 2:
             return {}
-        random, law, fingers = np.random.default_rng([self.seed, 9]), draw_parameters(self, self.laws), 4
-        shape = (self.laws, fingers, len(levels), len(self.hierarchy.components))
+        known = max(i for i, level in enumerate(levels[:-1]) if i == 0 or level.name != "session")
+        units, numbers = levels[known].units, levels[known].unit_numbers
+        laws, fingers, evaluations = self.laws, 4, 400_000
+        laws = min(laws, max(laws // 8, evaluations // (fingers * len(units))))
+        random, law = np.random.default_rng([self.seed, 9]), draw_parameters(self, laws, np.zeros_like(self.at))
+        shape = (laws, fingers, len(levels), len(self.hierarchy.components))
         deviates = random.standard_normal(shape)
         deviates[:, :, 1:] = 0.0
-        factors = {levels[0].name: law.make_factors(deviates)}
-        known = max(i for i, level in enumerate(levels[:-1]) if i == 0 or level.name != "session")
+        factors = {levels[0].name: law.shift_means(self.at).make_factors(deviates)}
         roots = np.asarray(law.effect_roots())[:, known + 1 :]
-        for unit, sums in zip(
-            levels[known].units, np.moveaxis(self._draw_known_sums(known, random), 1, 0), strict=True
-        ):
+        sums = self._draw_known_sums(known, laws, random)
+        for number, unit in enumerate(units):
+            own = self.covariates.z_scores[numbers == number]
+            mean = law.shift_means(np.where(np.ptp(own, axis=0) == 0.0, own[0], self.at)).mean
             lower = np.einsum("plij,pflj->pfi", roots, random.standard_normal(shape)[:, :, known + 1 :])
-            factors[unit] = law.add_Ci(law.mean[:, None] + sums[:, None] + lower)
-        return {
-            name: dict(
-                zip(self.finger.names, np.moveaxis(self.finger.evaluate(self._add_thicknesses(each, random)), -1, 0),
-                    strict=True)
-            )
+            factors[unit] = law.add_Ci(mean[:, None] + sums[:, number, None] + lower)
+        values = {
+            name: np.moveaxis(self.finger.evaluate(self._add_thicknesses(each, random)), -1, 0)
             for name, each in factors.items()
-        }  # fmt: skip
+        }
+        return {name: dict(zip(self.finger.names, each, strict=True)) for name, each in values.items()}
 
-    def _draw_known_sums(self, level: int, random: np.random.Generator) -> Float[np.ndarray, "laws units components"]:
+    def _draw_known_sums(
+        self, level: int, laws: int, random: np.random.Generator
+    ) -> Float[np.ndarray, "laws units components"]:
         """Draw the sums of the effects down to a level for the units of the records."""
         counts, components = self.hierarchy.effects.counts, len(self.hierarchy.components)
-        deviates = (random.standard_normal((self.laws, units, components)) for units in counts)
+        deviates = (random.standard_normal((laws, units, components)) for units in counts)
         draw = BatchEvaluator(Hierarchy.draw_sums, self.hierarchy, sum(counts) * self.hierarchy.origin.size, batch=256)
-        sums = draw(spread_points(self, self.laws), *deviates)
+        sums = draw(spread_points(self, laws), *deviates)
         first = sum(counts[:level])
         return sums[:, first : first + counts[level]]
 
@@ -509,10 +514,15 @@ def spread_points(population: Population, count: int) -> Float[np.ndarray, "coun
     return flat[np.linspace(0, len(flat) - 1, count).astype(int)]
 
 
-def draw_parameters(population: Population, count: int) -> PopulationParameters:
-    """Take `count` draws of the next finger's population parameters, spread over the chain."""
+def draw_parameters(
+    population: Population, count: int, at: Float[np.ndarray, " covariates"] | None = None
+) -> PopulationParameters:
+    """Take `count` draws of the population parameters, spread over the chain, for fingers with standardized covariates.
+
+    `at`: default, those of the next finger.
+    """
     law = evaluate_parameters(population.hierarchy, spread_points(population, count))
-    return jax.tree.map(np.asarray, law).shift_means(population.at)
+    return jax.tree.map(np.asarray, law).shift_means(population.at if at is None else at)
 
 
 def log_medians(parameters: PopulationParameters) -> dict[str, np.ndarray]:
