@@ -11,7 +11,7 @@ TEST_XLA_FLAGS = $(shell $(PY) -c 'from fitact.compiled import XLA_OPTIONS as o;
   --xla_backend_optimization_level=0
 PYTEST = XLA_FLAGS="$(TEST_XLA_FLAGS)" $(PY) -m pytest -n auto
 .DEFAULT_GOAL = help
-.PHONY: help env demo test test-slow test-slow-quick notebooks peers docs wheel extremes calibration calibration-quick session-calibration bench-calibration fuzz check lock plotly axe clean
+.PHONY: help env demo test test-slow test-slow-quick notebooks peers docs wheel extremes calibration calibration-quick session-calibration bench-calibration study-calibration fuzz check lock plotly axe clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -71,6 +71,10 @@ session-calibration: env
 # make bench-calibration   500 simulated benches with noise of V, delays, hum: are the stated uncertainties right?
 bench-calibration: env
 	$(PY) -m tests.bench_calibration --records 500 --out out/bench_calibration
+
+# make study-calibration   200 simulated studies of people and touches: are the stated spreads and forecasts right?
+study-calibration: env
+	$(PY) -m tests.study_calibration --studies 200 --out out/study_calibration
 
 # make calibration-quick   the same with the first 100 of them
 calibration-quick: env
