@@ -16,7 +16,7 @@ from fitact.likelihood.likelihood import Likelihood
 from fitact.populations.finger import Finger
 from fitact.populations.hierarchy import Hierarchy
 from fitact.progress import track_progress
-from fitact.sampling.convergence import pareto_smooth
+from fitact.sampling.convergence import CRITERIA, pareto_smooth
 from fitact.sampling.importance import systematic_resample
 
 MAX_INTEGRATION_ERROR = 0.1  # largest shift of a mean by the normal likelihoods, in posterior standard deviations
@@ -65,8 +65,8 @@ def correct_draws(
         error = left_out + 0.5 * float(np.std(log_totals[1] - log_totals[0]))
         if error <= MAX_INTEGRATION_ERROR:
             break
-    weighted, max_k_hat, least_draws = pareto_smooth(log_totals.mean(axis=0)), 0.7, 100.0
-    if not (weighted.k_hat <= max_k_hat and 1.0 / np.sum(np.square(weighted.weights)) >= least_draws):
+    weighted, least_draws = pareto_smooth(log_totals.mean(axis=0)), 100.0
+    if not (weighted.k_hat <= CRITERIA.k_hat and 1.0 / np.sum(np.square(weighted.weights)) >= least_draws):
         error = np.inf
     random = np.random.default_rng([seed, 7])
     places = random.permutation(systematic_resample(weighted.weights, len(chosen), float(random.uniform())))
