@@ -27,6 +27,7 @@ from data_synth.keys import validate_sections
 from fitact.batch import campaign
 from fitact.batch.fit_many import row_from_fit
 from fitact.data.readers.read import write_csv
+from fitact.model.circuit import FINGER_PARAMETERS
 
 PAGE = Path(__file__).parents[1] / "docs" / "what_works.md"
 BEGIN, END = "<!-- written by tests/capabilities.py -->\n", "<!-- end -->\n"
@@ -247,15 +248,12 @@ def try_population(given: Capability, folder: Path) -> Errors:
     """Return the errors of the medians, and of what is kept of each finger for the population."""
     records = [given.make_finger(number) for number in range(2)]
     found = fitact.population(records, given.make_scene(), seed=1, max_steps=50, progress=False)
-    draws, kept = found.parameters(), found.hierarchy.fingers
-    logs = {name: np.log(draws[name] / value) for name, value in TRUTH.items()}
+    logs = {name: np.log(found.parameters()[name] / value) for name, value in TRUTH.items()}
     errors = {name: float(values.mean() / values.std()) for name, values in logs.items()}
-    # the moments of log Rsc and log Csc that are kept depend on log Ci
-    off = math.log(TRUTH["Ci"]) - np.asarray(kept.center)
-    deviation = kept.mean + kept.slope[:, 0] * off - np.log([TRUTH["Rsc"], TRUTH["Csc"]])
-    errors["skin"] = float(np.max(np.abs(deviation) / np.sqrt(np.diagonal(kept.covariance, axis1=1, axis2=2))))
-    precision = np.asarray(kept.precision)  # of log Ci; 0 if only the prior tells it
-    errors["own Ci"] = float(np.max(np.abs(kept.weighted_offset - precision * off) / np.sqrt(precision + 1e-6)))
+    # of the normal likelihoods that are kept, in independent units
+    kept, truth = found.hierarchy, np.log([TRUTH[name] for name in FINGER_PARAMETERS])
+    deviations = np.asarray(kept.factors) @ (truth - np.asarray(kept.origin)[:3]) - np.asarray(kept.targets)
+    errors["kept"] = float(np.max(np.abs(deviations)))
     return errors
 
 

@@ -99,16 +99,18 @@ class Finger:
         `within` is that of log Rsc, log Csc and log Ci. The likelihood is taken as normal.
         """
         flat = 1e-6  # information that stands for none
-        R, target = self.skin_factor, self.skin_target
-        covariance = np.linalg.inv(R.T @ R + flat * np.eye(3))
-        factor = np.linalg.cholesky(np.linalg.inv(covariance + within)).T
+        left, sizes, right = np.linalg.svd(self.skin_factor)
+        variances = 1.0 / (np.square(sizes) + flat)
+        mean = right.T @ (variances * sizes * (left.T @ self.skin_target))
+        root = np.linalg.inv(np.linalg.cholesky((right.T * variances) @ right + within))
+        rotation, factor = np.linalg.qr(root)
         return dataclasses.replace(
             self,
             likelihood=None,
             names=FINGER_PARAMETERS,
             center=self.center[-3:],
             factor=factor,
-            target=factor @ covariance @ R.T @ target,
+            target=rotation.T @ root @ mean,
             log_sigma=np.zeros(0),
             log_sigma_sd=np.zeros(0),
         )
