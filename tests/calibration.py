@@ -196,7 +196,12 @@ def drawn(posterior: fitact.Posterior, rng: np.random.Generator) -> dict[str, np
 
 
 def collect(
-    path: Path, records: int, seed: int, workers: int, task: Callable[[int, int], dict[str, Any]] = ranks
+    path: Path,
+    records: int,
+    seed: int,
+    workers: int,
+    task: Callable[[int, int], dict[str, Any]] = ranks,
+    recycled: int = RECYCLED,
 ) -> list[dict[str, Any]]:
     """Return the rows of `task` for records 0 to `records`; rows missing in the file are computed and appended."""
     header = {"seed": seed, "sources": sources(inspect.getfile(task))}
@@ -211,7 +216,7 @@ def collect(
         temporary.write_text("".join(json.dumps(row) + "\n" for row in [header, *rows.values()]))
     began = time.monotonic()
     with path.open("a") as file:
-        for done, row in enumerate(computed(missing, seed, workers, task), 1):
+        for done, row in enumerate(computed(missing, seed, workers, task, recycled), 1):
             rows[row["record"]] = row
             file.write(json.dumps(row) + "\n")
             file.flush()
@@ -222,10 +227,10 @@ def collect(
 
 
 def computed(
-    numbers: list[int], seed: int, workers: int, task: Callable[[int, int], dict[str, Any]]
+    numbers: list[int], seed: int, workers: int, task: Callable[[int, int], dict[str, Any]], recycled: int
 ) -> Iterator[dict[str, Any]]:
     """Yield the rows of the records in the order of completion."""
-    each = RECYCLED * workers
+    each = recycled * workers
     for first in range(0, len(numbers), each):
         with pool(workers) as executor:
             futures = [executor.submit(task, number, seed) for number in numbers[first : first + each]]

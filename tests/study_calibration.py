@@ -152,7 +152,7 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("out/study"))
     chosen = parser.parse_args()
-    rows = collect(chosen.out / "places.jsonl", chosen.studies, chosen.seed, chosen.workers, places)
+    rows = collect(chosen.out / "places.jsonl", chosen.studies, chosen.seed, chosen.workers, places, recycled=4)
     passed = True
     for kind in (0, 1):
         some = [row for row in rows if row["record"] % 2 == kind]

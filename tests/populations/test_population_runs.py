@@ -249,6 +249,7 @@ def test_a_drive_for_the_study_needs_no_records(study_folder):
     scene = fitact.Scene.from_dict({"perception": {"threshold_force": "20 uN"}})
     design = fitact.design_drive(scene, study_folder, 0.9, touches=0.9)
     assert design.question.startswith("To be felt by 90 % of people in 90 % of touches")
+    assert "at least 90 % of people then feel it in 90 % of touches" in design.recommendation
     amplitude = design.options["sine"].assured
     assert fitact.design_drive(scene, study_folder, 0.9, touches=0.5).options["sine"].assured < amplitude
     assert fitact.design_drive(scene, study_folder, 0.5, touches=0.9).options["sine"].assured < amplitude
