@@ -264,6 +264,19 @@ def test_levels_of_a_population_have_panels_of_their_own():
     assert widths[0, -1] == pytest.approx(0.35**2 / (0.35**2 + 0.06**2))  # Rsc, the uppermost
 
 
+def test_many_people_have_their_names_below_their_touches():
+    """Twelve people: more than the legend has room for, which then names none."""
+    tree, content = test_pages.population_with_levels()
+    people = [f"P{number}" for number in range(12)]
+    finger = content["fingers"][0]
+    fingers = [finger | {"units": {"person": name, "repetition": name}} for name in people]
+    figure = draw_population(tree, content | {"fingers": fingers}, make=plt.figure)
+    panels = {each.get_title(): each for each in figure.axes if each.get_title()}
+    assert [label.get_text() for label in panels["Touches"].get_xticklabels()] == people
+    texts = [text.get_text() for text in panels["Fingers"].get_legend().get_texts()]
+    assert texts == ["new fingers", "records, 95 %"]
+
+
 def test_data_frames_hold_the_numbers(finger_fit, finger_posterior, track, spectrum):
     record = finger_fit.record.to_dataframe()
     assert list(record) == ["time_s", "V_V", "Vsc_V"]

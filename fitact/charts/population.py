@@ -55,9 +55,13 @@ def _draw_skin(axes: Axes, tree: Any, content: dict[str, Any], max_fingers: int 
         for key in ("q025", "q50", "q975")
     )
     widths_Rsc, widths_Csc = np.stack([Rsc - low_Rsc, high_Rsc - Rsc]), np.stack([Csc - low_Csc, high_Csc - Csc])
-    for name, members, color in _group_by_top_level(content):
+    groups = list(_group_by_top_level(content))
+    for number, (name, members, color) in enumerate(groups):
         bars = widths_Csc[:, members], widths_Rsc[:, members]
-        axes.errorbar(Rsc[members], Csc[members], *bars, fmt="o", ms=4, color=color, label=name)
+        label = (
+            name if len(groups) <= 10 else "records, 95 %" if number == 0 else None
+        )  # the legend has no room for more
+        axes.errorbar(Rsc[members], Csc[members], *bars, fmt="o", ms=4, color=color, label=label)
     axes.set(xscale="log", yscale="log", xlabel="Rsc", ylabel="Csc", title="Fingers")
     low, high = axes.get_xlim()
     log_ticks(axes.xaxis, "Ω", (1.0,) if high > 100.0 * low else (1.0, 2.0, 5.0))
@@ -74,10 +78,8 @@ def _group_by_top_level(content: dict[str, Any]) -> Iterator[tuple[str, list[int
     names = [finger["units"][top] for finger in content["fingers"]]
     unique = list(dict.fromkeys(names))
     colors = mpl.colormaps["viridis"](np.linspace(0.0, 0.9, len(unique)))
-    few = len(unique) <= 10  # names that a legend has room for
-    for number, (unit, color) in enumerate(zip(unique, colors, strict=True)):
-        label = unit if few else "records, 95 %" if number == 0 else ""
-        yield label, [i for i, name in enumerate(names) if name == unit], color
+    for unit, color in zip(unique, colors, strict=True):
+        yield unit, [i for i, name in enumerate(names) if name == unit], color
 
 
 def _draw_touches(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
@@ -100,7 +102,7 @@ def _draw_touches(axes: Axes, tree: Any, content: dict[str, Any]) -> None:
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.set_xticks(*zip(*ticks, strict=True), fontsize=9)
+    axes.set_xticks(*zip(*ticks, strict=True), fontsize=9, rotation=90.0 if len(ticks) > 10 else 0.0)
     axes.grid(axis="x", visible=False)
     axes.set(ylabel="over the population's median", title="Touches")
     axes.legend(fontsize=9)

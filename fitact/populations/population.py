@@ -27,7 +27,7 @@ from fitact.populations.next_finger import (
     finger_variance_fraction,
     redrawn_variance_fraction,
 )
-from fitact.populations.population_parameters import PopulationParameters
+from fitact.populations.population_parameters import COMPONENTS, PopulationParameters, level_endings
 from fitact.populations.population_text import (
     SHARES_LEGEND,
     UNIT_NAMES,
@@ -87,6 +87,11 @@ class Population(Display):
     within: WithinFinger | None = None
     laws: int = 1000
     fingers_per_law: int = 32
+
+    @property
+    def description(self) -> str:
+        """Records in a few words, e.g. "18 touches of 6 people"."""
+        return describe_units([{"level": level.name, "units": len(level.units)} for level in self.nesting.levels])
 
     @property
     def trusted(self) -> bool:
@@ -189,8 +194,8 @@ class Population(Display):
         """
         law = self._parameter_draws
         draws: dict[str, np.ndarray] = {}
-        components = [*SKIN, "area"][: law.mean.shape[-1]]
-        endings = ["", *(f"_{level.name}" for level in self.nesting.levels[1:])]
+        components = COMPONENTS[: law.mean.shape[-1]]
+        endings = level_endings(self.hierarchy.levels)
         for place, ending in enumerate(endings):
             draws |= {f"log_sd_{name}{ending}": law.log_sd[..., place, i] for i, name in enumerate(components)}
         per_unit = law.slopes / self.covariates.sd[:, None]
@@ -381,7 +386,7 @@ class Population(Display):
             name: {"mean": float(mean), "sd": float(sd), "next_finger": float(mean + at * sd)}
             | {
                 each: {"slope": summary.summarize_draws("slope", draws[f"slope_{component}_{name}"])}
-                for each, component in zip(self.hierarchy.components, (*SKIN, "area"), strict=False)
+                for each, component in zip(self.hierarchy.components, COMPONENTS, strict=False)
             }
             for name, mean, sd, at in zip(
                 self.covariates.names, self.covariates.mean, self.covariates.sd, self.at, strict=True
@@ -485,8 +490,7 @@ class Population(Display):
         law = self._parameter_draws
         medians = {name: summary.summarize_draws(name, np.exp(x)) for name, x in log_medians(law).items()}
         state = "reliable" if self.trusted else "unreliable"
-        units = [{"level": level.name, "units": len(level.units)} for level in self.nesting.levels]
-        return f"{describe_units(units)}, medians {summary.format_estimates(medians)}, {state}"
+        return f"{self.description}, medians {summary.format_estimates(medians)}, {state}"
 
     def _rows(self) -> tuple[tuple[str, ...], ...]:
         return population_table(self.to_dict())

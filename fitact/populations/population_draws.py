@@ -11,7 +11,7 @@ from fitact.errors import InputError
 from fitact.files import read_datatree
 from fitact.populations.finger import SHARED_PARAMETER, SKIN
 from fitact.populations.population import Population, draw_parameters
-from fitact.populations.population_parameters import PopulationParameters
+from fitact.populations.population_parameters import COMPONENTS, PopulationParameters, level_endings
 from fitact.populations.population_text import describe_units
 from fitact.summary import TRUSTED_RESULTS
 
@@ -28,11 +28,10 @@ class PopulationDraws(NamedTuple):
     @classmethod
     def from_population(cls, population: Population, count: int) -> Self:
         """Take `count` draws, spread over the chain."""
-        levels = [{"level": level.name, "units": len(level.units)} for level in population.nesting.levels]
         results = [finger.result for finger in population.fingers]
         names = tuple(level.name for level in population.nesting.levels)
         trusted = population.trusted and _are_mostly_good(results)
-        return cls(draw_parameters(population, count), names, describe_units(levels), trusted, population.warnings)
+        return cls(draw_parameters(population, count), names, population.description, trusted, population.warnings)
 
     @classmethod
     def from_folder(cls, path: str | os.PathLike[str], count: int) -> Self:
@@ -66,8 +65,8 @@ def _read_parameters(
     size = posterior[SHARED_PARAMETER].size
     chosen = np.linspace(0, size - 1, count).astype(int)
     draws = {str(name): values.values.ravel()[chosen] for name, values in posterior.data_vars.items()}
-    components = [*SKIN, *(["area"] if "log_sd_area" in draws else [])]
-    endings = ["", *(f"_{level}" for level in levels[1:])]
+    components = [name for name in COMPONENTS if f"log_sd_{name}" in draws]
+    endings = level_endings(levels)
     mean = np.zeros((count, len(components)))
     mean[:, :2] = np.log(np.stack([draws[name] for name in SKIN], axis=-1))
     for name, each in covariates.items():

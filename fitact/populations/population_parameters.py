@@ -1,11 +1,19 @@
 """Parameters of the distribution of fingers, with a spread at each level of the experiment, and draws from it."""
 
+from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Array, Float
 
 from fitact.compiled import array_module
+
+COMPONENTS = ("Rsc", "Csc", "area")  # of a touch, as the names of the parameters' draws have them
+
+
+def level_endings(levels: Sequence[str]) -> tuple[str, ...]:
+    """Return the ends of the names of the draws that belong to each level; the top level has none."""
+    return ("", *(f"_{level}" for level in levels[1:]))
 
 
 class PopulationParameters(NamedTuple):

@@ -612,6 +612,7 @@ def test_a_population_of_mostly_poor_fits_is_not_designed_for(poor: int, trusted
     results = ["misfit"] * poor + ["successful"] * (5 - poor)
     fitted = types.SimpleNamespace(
         nesting=nest_levels({}, 5),
+        description="5 fingers",
         fingers=[types.SimpleNamespace(result=result) for result in results],
         trusted=True,
         warnings=(),
