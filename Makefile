@@ -11,7 +11,7 @@ TEST_XLA_FLAGS = $(shell $(PY) -c 'from fitact.compiled import XLA_OPTIONS as o;
   --xla_backend_optimization_level=0
 PYTEST = XLA_FLAGS="$(TEST_XLA_FLAGS)" $(PY) -m pytest -n auto
 .DEFAULT_GOAL = help
-.PHONY: help env demo test test-slow test-slow-quick notebooks peers docs wheel extremes calibration calibration-quick session-calibration bench-calibration study-calibration fuzz check lock plotly axe clean
+.PHONY: help env demo picture test test-slow test-slow-quick notebooks peers docs wheel extremes calibration calibration-quick session-calibration bench-calibration study-calibration fuzz check lock plotly axe clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -21,6 +21,10 @@ env:
 
 demo: env
 	.venv/bin/fitact run data_synth/records/finger_direct.csv --scene data_synth/records/finger_direct.toml --out out/demo --seed 1
+
+# make picture   the demo's report as the picture of README.md, docs/report.png; needs Chromium
+picture: demo
+	$(PY) tools/picture_report.py
 
 test: env
 	$(PYTEST) --dist loadfile -m "not slow"

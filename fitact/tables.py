@@ -12,17 +12,20 @@ def align_row(cells: Sequence[str], widths: Sequence[int]) -> str:
     return (f"{first:{widths[0]}}" + "".join(columns)).rstrip()
 
 
-def align_table(rows: Iterable[Sequence[str]], gap: int = 3) -> list[str]:
+def align_table(rows: Iterable[Sequence[str]], gap: int = 3, words: int = 0) -> list[str]:
     """Return a line for each row, as wide as its cells need: the first column to the left, the others to the right.
 
-    A row of one cell is a title and sets no width. A cell beyond the first row's columns is a remark, to the left.
+    The last `words` columns hold words, to the left. A row of one cell is a title and sets no width. A cell beyond the
+    first row's columns is a remark, to the left.
     """
     rows = [list(row) for row in rows]
     count = len(rows[0])
     widths = [max(len(row[i]) for row in rows if len(row) > max(i, 1)) for i in range(count)]
     lines = []
     for row in rows:
-        cells = [f"{cell:>{width}}" for cell, width in zip(row[1:count], widths[1:], strict=False)]
+        sides = [">"] * (count - 1 - words) + ["<"] * words
+        columns = zip(row[1:count], sides, widths[1:], strict=False)
+        cells = [f"{cell:{side}{width}}" for cell, side, width in columns]
         lines.append((" " * gap).join([f"{row[0]:{widths[0]}}", *cells, *row[count:]]).rstrip())
     return lines
 

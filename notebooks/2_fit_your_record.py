@@ -85,11 +85,12 @@ assert fit.identifiability.verdict == "prior-limited"
 fit
 
 # %% [markdown]
-# `print(fit)` adds what the force rests on and what to measure next. The verdict matters more than the numbers:
-# "prior-limited". The data determine the divider g and the time constant b to a few parts in ten thousand, but not the
-# contact area. So Rsc, Csc and the force are as uncertain as the prior on Ci. The force is computed with eq. (22) of
-# the reference paper; these data do not test that law. The residuals below are consistent with noise, also at the
-# edges, so the circuit describes the record.
+# The uncertainties are those that one would sign: "unstated gains" means that the scene does not state the instruments,
+# so that usual errors are included. `print(fit.summary(verbose=True))` adds all other quantities, what noise alone
+# allows, and what to measure next. The verdict matters more than the numbers: "prior-limited". Noise leaves a few parts
+# in ten thousand on the divider g and the time constant b, but the data do not determine the contact area. The force is
+# computed with eq. (22) of the reference paper; these data do not test that law. The residuals below are consistent
+# with noise, also at the edges, so the circuit describes the record.
 
 # %%
 fit.plot()
@@ -110,7 +111,8 @@ posterior.plot()
 plt.show()
 
 # %% [markdown]
-# Vsc does not separate Ci from Rsc and Csc, so the posterior is a line in the last two pairs. The force over time:
+# Vsc does not separate Ci from Rsc and Csc, so the posterior lies along a line in the last two pairs; unstated gains
+# widen it. The force over time:
 
 # %%
 posterior.plot_force()
@@ -120,13 +122,16 @@ plt.show()
 draws = posterior.parameters()
 quantities = draws | posterior.derived()
 spread = {name: np.std(np.log(quantities[name])) for name in ("Rsc", "Csc", "Ci", "force_mean", "g", "b")}
+combined = posterior.combined_draws
+print(f"{'':12} {'combined':>8}  noise and prior alone")
 for name, sd in spread.items():
-    print(f"{name:12} ± {100 * sd:.2g} %")
+    print(f"{name:12} {100 * np.std(np.log(combined[name])):>6.2g} %  {100 * sd:.2g} %")
 assert max(spread["g"], spread["b"]) < 1e-3
 assert all(0.03 < spread[name] < 0.07 for name in ("Rsc", "Csc", "Ci", "force_mean"))
 
 # %% [markdown]
-# The record is simulated, so the true values are known. They lie within two posterior standard deviations:
+# The record is simulated with exact instruments, so noise and prior alone must explain the distance from the true
+# values. They lie within two standard deviations of the posterior:
 
 # %%
 truth = json.loads((RECORDS / "finger_direct.json").read_text())["truth"]

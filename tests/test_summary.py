@@ -6,7 +6,8 @@ import scipy.stats
 import fitact
 from fitact import summary
 from fitact.fitting.minimum import RESULT_NAMES
-from fitact.summary import format_estimate, format_interval, quantity_table, summarize_normal
+from fitact.result_text import quantity_table
+from fitact.summary import format_estimate, format_interval, summarize_normal
 from fitact.what_now import advice_sections, explain
 
 
@@ -43,7 +44,7 @@ def test_parameters_of_the_finger_and_of_the_measurement_stand_apart(finger_post
     assert headings == ["circuit", "computed, not measured", "measurement"]
     names = [row[0] for row in rows]
     assert names.index("measurement") < names.index("charge")
-    assert next(row for row in rows if row[0] == "charge")[5].startswith("transient in Vsc at the first sample")
+    assert next(row for row in rows if row[0] == "charge")[6].startswith("transient in Vsc at the first sample")
 
 
 def test_every_result_has_its_advice():

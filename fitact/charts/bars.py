@@ -1,5 +1,6 @@
 """Bar charts: the errors of a plan's omissions, and uncertainty budgets."""
 
+import math
 from typing import Any
 
 import matplotlib as mpl
@@ -7,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fitact.charts.figure import ALERT, DATA, MODEL, PRIOR, FigureMaker
+from fitact.result_text import list_components
 
 
 def draw_plan(content: dict[str, Any], make: FigureMaker = Figure) -> Figure:
@@ -36,16 +38,22 @@ def draw_plan(content: dict[str, Any], make: FigureMaker = Figure) -> Figure:
     return figure
 
 
-def draw_budgets(entries: dict[str, Any], bars: int = 5, make: FigureMaker = Figure) -> Figure:
-    """Draw the largest components of each quantity, in per cent; `entries` is `budget` of summary.json."""
-    columns, rows = 2, -(-len(entries) // 2)
+def draw_budgets(content: dict[str, Any], bars: int = 5, make: FigureMaker = Figure) -> Figure:
+    """Draw the largest components of each combined uncertainty, in per cent; `content` is that of summary.json."""
+    names = list(content["budget"])
+    columns, rows = 2, -(-len(names) // 2)
     figure = make(figsize=(9.0, 0.6 + 1.5 * rows), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).flat
-    for (name, entry), axes in zip(entries.items(), panels, strict=False):
-        largest = [each for each in entry["components"] if each["share"] >= 0.001][:bars][::-1]
-        sources, sizes = [each["source"] for each in largest], [100.0 * each["u"] for each in largest]
+    for name, axes in zip(names, panels, strict=False):
+        components = list_components(name, content)
+        largest = [each for each in components if each["share"] >= 0.001][:bars][::-1]
+        sources, sizes = (
+            [each["source"].partition(" (")[0] for each in largest],
+            [100.0 * each["u"] for each in largest],
+        )
         axes.barh(sources, sizes, color=[ALERT if each["type"] == "A" else MODEL for each in largest])
-        axes.set_title(f"{name}: u = {100.0 * entry['u']:.2g} %", fontsize=10.0, loc="left")
+        u = math.hypot(*(each["u"] for each in components))
+        axes.set_title(f"{name}: u = {100.0 * u:.2g} %", fontsize=10.0, loc="left")
         axes.tick_params(labelsize=8.0)
         axes.set_xlabel("component of u, %", fontsize=8.0)
         axes.grid(axis="y", visible=False)

@@ -42,7 +42,7 @@ def time_chart(time: np.ndarray, series: Sequence[Series], columns: int = 2000) 
 
 
 def time_plot(
-    time: np.ndarray, series: Sequence[Series], columns: int = 2000, title: str = "", row_pixels: int = 145
+    time: np.ndarray, series: Sequence[Series], columns: int = 2000, title: str = "", row_pixels: int = 100
 ) -> Plot:
     """Draw channels (time in s) one below the other, each with its fit and, below, the residuals.
 

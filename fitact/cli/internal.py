@@ -4,7 +4,7 @@ import lazy_loader
 
 __getattr__, __dir__, __all__ = lazy_loader.attach(
     "fitact",
-    submodules={"summary"},
+    submodules={"result_text", "summary"},
     submod_attrs={
         "app.server": ["serve"],
         "app.warm_commands": ["WarmCommands"],

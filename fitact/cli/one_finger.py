@@ -35,6 +35,7 @@ def run(
     seed: options.Seed = 0,
     tolerance: options.Tolerance = 1e-3,
     fresh: options.Fresh = False,
+    verbose: options.Verbose = False,
     json: options.Json = False,
 ) -> None:
     """Fit records and spectra, sample the posterior and write a report, all into one folder.
@@ -46,7 +47,8 @@ def run(
     folder = out or Path(f"{records[0].name.removesuffix('.gz').removesuffix('.csv')}-fitact")
     choice = spectrum, shunt, band
     planned = _fit_records(records, scene, (channel, scale, rate), choice, model, tolerance)
-    print_stderr(planned.sentence)
+    if planned.omits_elements or verbose:
+        print_stderr(planned.sentence)
     chain = folder / "chain.h5"
     if fresh:
         chain.unlink(missing_ok=True)
@@ -57,12 +59,12 @@ def run(
     content = posterior.summary() | {"plan": planned.to_dict(), "command": command_line()}
     write_json(folder / "summary.json", content)
     if context.command.name == "sample":
-        end = f"wrote {folder}; to write the report, run: fitact report {folder}"
+        end = f"wrote {folder}; for the report: fitact report {folder}"
     else:
-        print_stderr("writing the report")
         reporting.write_report(folder / "report.html", posterior.to_datatree(), content)
         end = f"open {folder / 'report.html'}"
-    show(f"{posterior}\n{end}", content, json, posterior.trusted)
+    text = internal.result_text.describe_summary(content, verbose=verbose)
+    show(f"{text}\n{end}{'' if verbose else ' (more here: --verbose)'}", content, json, posterior.trusted)
 
 
 @app.command()
@@ -90,6 +92,7 @@ def fit(
         bool,
         typer.Option("--intervals", help="Add 95 % profile-likelihood intervals, with and without the prior."),
     ] = False,
+    verbose: options.Verbose = False,
     json: options.Json = False,
 ) -> None:
     """Fit records and spectra by least squares; print parameters, standard errors and identifiability.
@@ -100,7 +103,9 @@ def fit(
     choice = spectrum, shunt, band
     planned = _fit_records(records, scene, (channel, scale, rate), choice, model, tolerance, starts)
     fitted = planned.fit
-    text, content = f"{fitted}\n{planned.sentence}", fitted.to_dict() | {"plan": planned.to_dict()}
+    text, content = fitted.summary(verbose=verbose), fitted.to_dict() | {"plan": planned.to_dict()}
+    text += f"\n{planned.sentence}" if planned.omits_elements or verbose else ""
+    text += "" if verbose else "\nbudget, nuisance parameters and notes: --verbose; posterior and report: fitact run"
     if intervals:
         with_prior, without = fitted.intervals(), fitted.intervals(prior=False)
         text = f"{text}\n{internal.table(with_prior, without)}"
@@ -117,10 +122,11 @@ app.command("sample", help="Fit records and sample the posterior: the same as `r
 
 
 @app.command()
-def summary(directory: options.Results, json: options.Json = False) -> None:
-    """Print the table of results that `run` or `sample` wrote into DIR."""
+def summary(directory: options.Results, verbose: options.Verbose = False, json: options.Json = False) -> None:
+    """Print the results that `run` or `sample` wrote into DIR."""
     content = internal.summary.load(directory)
-    show(internal.summary.table(content), content, json, internal.summary.is_trusted(content))
+    text = internal.result_text.describe_summary(content, verbose=verbose)
+    show(text, content, json, internal.summary.is_trusted(content))
 
 
 @app.command()
@@ -138,7 +144,7 @@ def budget(
         if name not in content["budget"]:
             raise InputError(f"--quantity {name}: there is no such budget; known: {', '.join(content['budget'])}")
     chosen = {name: content["budget"][name] for name in names}
-    show(internal.summary.budget_text(content, names), chosen, json, internal.summary.is_trusted(content))
+    show(internal.result_text.budget_text(content, names), chosen, json, internal.summary.is_trusted(content))
 
 
 @app.command()

@@ -103,6 +103,9 @@ Seed = Annotated[
     int,
     typer.Option("--seed", min=0, max=2**63 - 1, help="Random seed; equal seeds give equal draws."),
 ]
+Verbose = Annotated[
+    bool, typer.Option("--verbose", help="Print all quantities, what they rest on, diagnostics, notes and advice.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print only the result, as JSON, on standard output.")]
 Tolerance = Annotated[
     float,

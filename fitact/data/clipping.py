@@ -8,8 +8,8 @@ def clipping_mask(values: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " s
     """Return a mask of the samples in saturation, or within `margin` samples of saturation.
 
     A saturation level is an extreme value that occurs `min_run` times in a row, and `min_count_ratio` times as often
-    as the adjacent level; at a rounded smooth peak this ratio is at most 2.4. A signal with few levels, such as an
-    ideal square, has no saturation level. A drive with flat tops cannot be distinguished from a clipped one.
+    as the adjacent level; at a rounded smooth peak this ratio is at most 2.4. A signal that `has_flat_levels` has no
+    saturation level. Another drive with flat tops cannot be distinguished from a clipped one.
     """
     min_run, min_count_ratio, margin = 4, 8.0, 2
     railed = np.zeros(values.size, dtype=bool)
@@ -19,9 +19,19 @@ def clipping_mask(values: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " s
         if min_run <= count < values.size and longest_run(is_extreme) >= min_run:
             others = upward[~is_extreme]
             railed |= is_extreme & (count > min_count_ratio * np.count_nonzero(others == others.max()))
-    if not railed.any():
-        return railed
+    if not railed.any() or has_flat_levels(values):
+        return np.zeros(values.size, dtype=bool)
     return np.convolve(railed, np.ones(2 * margin + 1), mode="same") > 0.5
+
+
+def has_flat_levels(values: Float[np.ndarray, " samples"], max_levels: int = 6, min_fraction: float = 0.95) -> bool:
+    """Return whether nearly all samples have one of a few values, as of a square without noise or rounded above it.
+
+    Three plateaus, each on the edge of two levels of an ADC, have six values. A clipped signal has its noise, or its
+    way to the rail, in more than the other samples.
+    """
+    _, counts = np.unique(values, return_counts=True)
+    return bool(np.sum(np.sort(counts)[-max_levels:]) >= min_fraction * values.size)
 
 
 def describe_clipping(channel: str, clipped: Bool[np.ndarray, " samples"]) -> str:

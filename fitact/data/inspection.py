@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from fitact.data.clipping import clipping_mask
+from fitact.data.clipping import clipping_mask, has_flat_levels
 from fitact.data.readers.capture import Capture, FileChannel, has_standard_names, replace_rounded_times, to_record
 from fitact.data.readers.read import merge_other_files, read_capture
 from fitact.data.record import (
@@ -222,7 +222,12 @@ def check_channel(name: str, unit: str, time: Samples, values: Samples, frequenc
             f"{name} is clipped at {railed:,} samples ({values.min():.4g} to {values.max():.4g}): it exceeds the range"
             " of the oscilloscope or of the amplifier"
         )
-    if rounding_noise_sd(values) > 0.0:
+    if has_flat_levels(values):
+        found.append(
+            f"{name} has plateaus without noise ({values.min():.4g} to {values.max():.4g}): an ideal wave, one rounded"
+            " to steps above its noise, or the end of a range; compare them with the levels that you set"
+        )
+    elif rounding_noise_sd(values) > 0.0:
         found.append(f"{name} is rounded to steps larger than its noise; record with a smaller range")
     largest = float(np.max(np.abs(values)))
     if largest > LARGEST_VALUES.get(unit, math.inf):

@@ -18,6 +18,12 @@ from fitact.model.skin import WithSkin, circuit_parameters, constant_skin_circui
 from fitact.units import format_engineering
 
 _UNITS = {"Vsc": "V", "I": "A"}
+NEEDS = {  # what a suggested change needs
+    "current": "a shunt in the loop, and a channel for it",
+    "series resistor": "a resistor of known value",
+    "better Ci": "a picture of the footprint, and the panel's data sheet",
+    "longer record": "time",
+}
 
 
 class Change(NamedTuple):
@@ -60,10 +66,9 @@ def changes(adc_steps: Mapping[Channel, float] | None = None) -> tuple[Change, .
 
 def suggest_measurements(experiment: Experiment, gradient: Gradient) -> tuple[DesignOption, ...]:
     """Evaluate the changes that a fit suggests, best first, if they can be made and computed."""
-    names = ("current", "series resistor", "better Ci", "longer record")
     as_it_is, options = CandidateDesign((experiment,)), []
     for change in changes():
-        candidate = change(as_it_is) if change.name in names else None
+        candidate = change(as_it_is) if change.name in NEEDS else None
         if candidate is not None and candidate.experiments[0] is not experiment:
             # a failed fit may end at a circuit whose current overflows
             with contextlib.suppress(np.linalg.LinAlgError):

@@ -1,6 +1,6 @@
 """Sources of error behind the coordinates of a fit, for its uncertainty budget."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -8,15 +8,21 @@ from jaxtyping import Float
 from fitact import summary
 from fitact.fitting.geometry import Contribution
 from fitact.fitting.least_squares import LeastSquaresResult
+from fitact.instrument.classes import USUAL_STRAY, typical_gains
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.skin import probe_parameters
-from fitact.prior.distributions import LogNormal
+from fitact.prior.distributions import LogNormal, Uniform
 from fitact.problem.instrument_errors import UNRESOLVED_V, ErrorCoordinate, InstrumentError
+from fitact.scene.assumptions import states_Ci
 from fitact.scene.scene import Scene
 from fitact.uncertainty.budget import Component, ErrorSource
 from fitact.uncertainty.effect_size import EffectSizes
+from fitact.units import format_engineering
 
+UNSTATED = "unstated gains"
 # cheapest ways to reduce an error
+_STATE_GAIN = "state your instruments under [instrument], and calibrate them with a dummy circuit"
+_STATE_STRAY = "record once without the finger ([[calibration]] circuit = 'open'), or take I in the ground lead"
 _CALIBRATE = "record a dummy circuit of known parts, or both channels on one node, with the same pieces and ranges"
 _MEASURE = {
     "Ci": "also record the current I, or measure Ci of this panel at this contact area",
@@ -49,7 +55,8 @@ def list_error_sources(
         label, remedy = f"prior of {name}", _MEASURE.get(name, "state a narrower prior, if you know more")
         if load is not None and name in loads:
             label = f"input {name.removeprefix('probe_')} ({load.name})"
-        sources.append((ErrorSource(label, likelihood.prior[name], remedy, is_shared=name in loads),))
+        origin = "default Ci" if name == "Ci" and not states_Ci(scene) else ""
+        sources.append((ErrorSource(label, likelihood.prior[name], remedy, is_shared=name in loads, origin=origin),))
     return tuple(sources)
 
 
@@ -59,7 +66,7 @@ def geometry_component(contribution: Contribution) -> Component:
     remedy = "measure it, e.g. by optical coherence tomography" if each.name == "skin_thickness" else "measure it"
     source = f"{summary.describe_quantity(each.name)}{'' if each.stated else ' (default, from the literature)'}"
     size = each.relative_sd, each.sensitivity
-    return Component(source, "B", *size, each.distribution, remedy, in_posterior=each.stated)
+    return Component(source, "B", *size, each.distribution, remedy, in_posterior=each.stated, origin=each.origin)
 
 
 def structure_components(effects: EffectSizes, quantity: str) -> tuple[Component, ...]:
@@ -69,12 +76,32 @@ def structure_components(effects: EffectSizes, quantity: str) -> tuple[Component
         ("other causes that fit as well", effects.structure.get(quantity, 0.0)),
     )
     remedy = "see the rivals of the fit, and test the likely one"
-    return tuple(Component(name, "B", u, 1.0, None, remedy, in_posterior=False) for name, u in found if u > 0.0)
+    known = None, remedy, False, False, "misfit"  # no distribution, not in the posterior, not shared
+    return tuple(Component(name, "B", u, 1.0, *known) for name, u in found if u > 0.0)
+
+
+def unstated_components(errors: Mapping[str, float], stray: float) -> tuple[Component, ...]:
+    """Return the components of usual errors that nobody stated.
+
+    `errors`: sensitivity to the gain of each channel, by channel. `stray`: relative change of the quantity by a stray
+    capacitance of `USUAL_STRAY`, which any value from 0 to there is taken to be as likely as.
+    """
+    rows = []
+    for channel, sensitivity in errors.items():
+        for name, tolerance in typical_gains(channel).items():
+            law = Uniform.with_tolerance(1.0, tolerance)
+            source = f"{channel} gain of a usual {name}, not stated"
+            rows.append(Component(source, "B", float(law.log_sd), sensitivity, law, _STATE_GAIN, False, True, UNSTATED))
+    if stray:
+        source = f"stray capacitance, not stated (0 to {format_engineering(USUAL_STRAY, 'F')})"
+        rows.append(Component(source, "B", 3.0**-0.5, stray, None, _STATE_STRAY, False, True, "unstated stray C"))
+    return tuple(rows)
 
 
 def _instrument_source(error: InstrumentError) -> ErrorSource:
     is_own = error.source.startswith(UNRESOLVED_V)
-    return ErrorSource(error.source, error.distribution, _CALIBRATE, error.power, is_shared=not is_own)
+    origin = "rounding of V" if is_own else "instruments"
+    return ErrorSource(error.source, error.distribution, _CALIBRATE, error.power, not is_own, origin)
 
 
 def noise_information(

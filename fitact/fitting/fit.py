@@ -149,7 +149,11 @@ def _assemble_fit(
     figures |= information_criteria(theta.size, traces)
     if optima is not None:
         figures |= {"optima": len(optima.start_counts), "starts_failed": optima.n_failed}
-    said = _collect_remarks(problem, laplace, traces, optimum, without_scene)
+    channels = [trace.channel for trace in traces]
+    stray = None
+    if remarks.has_unstated_stray(problem.sources, channels):
+        stray = remarks.estimate_stray_changes(channels, optimum)
+    said = _collect_remarks(problem, laplace, traces, optimum, stray, without_scene)
     tests = [check_kramers_kronig(each.record) for each in traces if isinstance(each.record, Spectrum)]
     doubts = [test.doubt for test in tests if test.doubt]
     result, effects = diagnose_fit(solution, root, traces, optima), None
@@ -174,6 +178,7 @@ def _assemble_fit(
         error_sources=list_error_sources(likelihood, problem.coordinates, first.scene),
         noise_information=noise_information(likelihood, solution),
         gain_shifts=gain_shifts(likelihood, solution, root),
+        stray_changes=stray or {},
         misfit_effects=effects,
         kramers_kronig=max(tests, key=lambda test: (not test.passed, test.worst_residual), default=None),
     )
@@ -184,6 +189,7 @@ def _collect_remarks(
     laplace: Laplace,
     traces: tuple[ChannelFit, ...],
     optimum: CircuitValues,
+    stray_changes: Mapping[str, float] | None,
     without_scene: bool,
 ) -> remarks.Remarks:
     """Return what is to be said of the records, the parameters and the scene."""
@@ -206,7 +212,8 @@ def _collect_remarks(
     warnings += remarks.prior_warnings(likelihood, theta, spread, stated)
     force_peak = math.exp(laplace.log_derived[0][derived.DERIVED_NAMES.index("force_peak")])
     warnings += remarks.plausibility_warnings(first.record, first.scene, first.choice, optimum, force_peak)
-    notes += remarks.stray_notes(problem.sources, traces, optimum)
+    if stray_changes is not None:
+        notes.append(remarks.stray_note(stray_changes))
     assumed = remarks.describe_assumed_Ci(None if without_scene else first.scene, likelihood, laplace.prior_sets_Ci)
     notes += assumed.notes
     notes += laplace.geometry.notes(first.scene, likelihood, theta)

@@ -18,6 +18,7 @@ from fitact.model.force import Geometry, force_constant
 from fitact.prior.distributions import Distribution, LogNormal
 from fitact.scene.scene import Scene
 
+_SYMBOLS = {"skin_thickness": "Tsc", "insulator_thickness": "Ti", "contact_area": "area", "friction_coefficient": "mu"}
 _FORCE = [i for i, name in enumerate(DERIVED_NAMES) if name.startswith("force")]
 _MEAN, _FRICTION = DERIVED_NAMES.index("force_mean"), DERIVED_NAMES.index("friction_mean")
 _SKIN_THICKNESS_SOURCE = (
@@ -46,6 +47,7 @@ class Contribution(NamedTuple):
 
     name: str  # such as "skin_thickness"
     source: str
+    origin: str  # the same in two words
     relative_sd: float  # sd of ln x
     sensitivity: float  # Cov(ln q, ln x) / var(ln x); d ln q / d ln x where x is independent of the circuit
     distribution: Distribution
@@ -72,6 +74,7 @@ class UncertainGeometry:
         assumed: distributions from the literature where it states none, with their sources.
         plates: capacitances that follow from `stated`, as in `Scene.plates`.
         friction_is_measured: whether the friction is a channel, so that it does not depend on this geometry.
+        value_is_stated: whether the scene states the values of `assumed`.
     """
 
     geometry: Geometry
@@ -81,6 +84,7 @@ class UncertainGeometry:
     assumed: Mapping[str, tuple[Distribution, str]]
     plates: Mapping[str, tuple[dict[str, float], float]]
     friction_is_measured: bool
+    value_is_stated: bool
 
     @classmethod
     def from_scene(cls, scene: Scene, geometry: Geometry | None = None) -> Self:
@@ -97,6 +101,7 @@ class UncertainGeometry:
             {name: each for name, each in assumed.items() if name not in stated},
             scene.plates(),
             "Ft" in scene.measurement.channels,
+            "thickness" in scene.skin.model_fields_set,
         )
 
     def draw_logs(
@@ -220,12 +225,13 @@ class UncertainGeometry:
         table = {}
         for quantity, row in rows.items():
             entries = [
-                _contribution(name, "stated in the scene", law, covariance_with / law.log_sd**2, stated=True)
+                _contribution(name, "stated in the scene", law, covariance_with / law.log_sd**2, "stated")
                 for (name, law), covariance_with in zip(self.stated.items(), row, strict=True)
             ]
             for i, (name, (law, source)) in enumerate(self.assumed.items()):
                 slope = others[quantity][i] if quantity in others else 0.0
-                entries.append(_contribution(name, f"default: {source}", law, slope, stated=False))
+                kind = "spread of" if self.value_is_stated else "default"
+                entries.append(_contribution(name, f"default: {source}", law, slope, kind))
             table[quantity] = tuple(entries)
         return table
 
@@ -254,9 +260,11 @@ class UncertainGeometry:
         return tuple(sentences)
 
 
-def _contribution(name: str, origin: str, law: Distribution, sensitivity: Any, *, stated: bool) -> Contribution:
-    source = f"{summary.describe_quantity(name)} ({origin})"
-    return Contribution(name, source, float(law.log_sd), float(sensitivity), law, stated)
+def _contribution(name: str, origin: str, law: Distribution, sensitivity: Any, kind: str) -> Contribution:
+    description = summary.describe_quantity(name)
+    words = f"{kind} {_SYMBOLS.get(name, description)}"
+    size = float(law.log_sd), float(sensitivity)
+    return Contribution(name, f"{description} ({origin})", words, *size, law, stated=kind == "stated")
 
 
 def _regression(

@@ -14,7 +14,7 @@ from fitact.compiled import double_precision
 from fitact.experiment.blind_directions import STRAY, blind_directions, gain_names, name_direction
 from fitact.experiment.experiment import DesignOption
 from fitact.experiment.fisher import Experiment
-from fitact.experiment.options import suggest_measurements
+from fitact.experiment.options import NEEDS, suggest_measurements
 from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.units import format_percent
 
@@ -27,6 +27,7 @@ class NextMeasurement(NamedTuple):
 
     structural: bool = False  # whether no record of these channels could determine the blind direction
     remedy: str = ""
+    advice: str = ""  # the part of `remedy` without the expected uncertainties of `remedies`
     remedies: tuple[DesignOption, ...] = ()  # the suggested measurements, best first
 
 
@@ -67,25 +68,28 @@ class Identifiability:
         force = f"Uncertainty of the mean force{brackets}: {show(self.force_sd, now)} now"
         experiment = self.experiment
         if experiment is None or self.force_gradient is None:
-            if self.channels == ("Vsc",):
-                return NextMeasurement(True, f"{force}; measure the impedance, or record the current I beside Vsc.")
-            return NextMeasurement(remedy=f"{force}; measure from below the corner frequency of the skin to above it.")
+            is_gain = self.channels == ("Vsc",)
+            advice = "measure from below the corner frequency of the skin to above it."
+            advice = "measure the impedance, or record the current I beside Vsc." if is_gain else advice
+            return NextMeasurement(is_gain, f"{force}; {advice}", advice[0].upper() + advice[1:])
         with double_precision():
             stray = experiment.stray_capacitance
             structure = blind_directions(experiment.circuit, experiment.free, experiment.channels, stray)
             options = suggest_measurements(experiment, self.force_gradient)
         figures = [f"{show(option.force_sd, after)} with {option.text}" for option in options]
-        remedy = f"{force}. Expected after one change: {', '.join(figures)}."
+        expected = f"{force}. Expected after one change: {', '.join(figures)}."
+        hints: list[str] = []
         if self.verdict == "unidentified":
             most = max(self.blind_direction, key=lambda name: abs(self.blind_direction[name]))
             what = "Ci and this contact area" if most in FINGER_PARAMETERS else most
-            remedy = f"No prior narrows that direction; state one for {what} under [prior]. {remedy}"
+            hints.append(f"No prior narrows that direction; state one for {what} under [prior].")
         gains = structure.directions[:, [name in gain_names(structure.channels) for name in structure.names]]
         if np.any(np.abs(gains) > 0.1):  # components of a unit vector above this belong to a direction
-            remedy += (
-                " The free gain is confounded with the circuit; calibrate the probe and sample each edge several times."
+            hints.append(
+                "The free gain is confounded with the circuit; calibrate the probe and sample each edge several times."
             )
-        return NextMeasurement(structure.contains(self.blind_direction), remedy, options)
+        remedy = " ".join((expected, *hints))
+        return NextMeasurement(structure.contains(self.blind_direction), remedy, " ".join(hints), options)
 
     @property
     def structural(self) -> bool:
@@ -98,6 +102,11 @@ class Identifiability:
         return self.next_measurement.remedy
 
     @property
+    def advice(self) -> str:
+        """Advice beside the suggested measurements, in sentences; "" for none."""
+        return self.next_measurement.advice
+
+    @property
     def remedies(self) -> tuple[DesignOption, ...]:
         """Suggested next measurements, best first; none if all parameters are identified."""
         return self.next_measurement.remedies
@@ -106,10 +115,15 @@ class Identifiability:
         """Return the section of fit.json and summary.json."""
         names = (
             "verdict", "eigenvalues", "blind_direction", "blind_name", "structural", "prior_sd", "force_from_prior",
-            "force_sd", "force_contraction", "remedy", "remedies", "channels",
+            "force_sd", "force_contraction", "remedy", "advice", "remedies", "channels",
         )  # fmt: skip
         values = {name: getattr(self, name) for name in names}
-        return values | {"remedies": [remedy.to_dict() for remedy in self.remedies]}
+        after = self.unchanged[1]
+        remedies = [
+            each.to_dict() | {"u": math.hypot(each.force_sd, after), "needs": NEEDS[each.name]}
+            for each in self.remedies
+        ]
+        return values | {"remedies": remedies}
 
     def __str__(self) -> str:
         names = list(self.blind_direction)
@@ -122,8 +136,9 @@ class Identifiability:
         return (
             f"{self.verdict}: {self.reason}{direction}. The prior sets this"
             f" combination (± {format_percent(math.expm1(self.prior_sd))}) and contributes"
-            f" {100.0 * self.force_from_prior:.3g} % of the variance of the force. {self.remedy}"
-        )
+            f" {100.0 * self.force_from_prior:.3g} % of the variance that its posterior gives to the force."
+            f" {self.advice}"
+        ).rstrip()
 
     @property
     def reason(self) -> str:

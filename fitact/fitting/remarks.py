@@ -1,7 +1,7 @@
 """Warnings and notes about a fit that is otherwise reliable, in sentences."""
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -11,8 +11,8 @@ from fitact.data.inspection import check_divider
 from fitact.data.plausibility import check_plausibility, insulator_voltage
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.data.spectrum import Spectrum
-from fitact.fitting.channel_fit import ChannelFit
 from fitact.fitting.residual_statistics import is_undersampled
+from fitact.instrument.classes import USUAL_STRAY
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.model.circuit import FINGER_PARAMETERS, RC
 from fitact.model.skin import constant_skin_circuit
@@ -161,32 +161,39 @@ def unfitted_channel_notes(record: Record, fitted: Collection[str]) -> list[str]
     ]
 
 
-def stray_notes(
-    sources: Sequence[Source], traces: Sequence[ChannelFit], optimum: CircuitValues, usual: float = 100e-12
-) -> list[str]:
-    """Return a note on a current in the drive lead whose stray capacitance nobody stated; `usual` is in F."""
+def has_unstated_stray(sources: Sequence[Source], channels: Sequence[str]) -> bool:
+    """Return whether a fitted current was taken in the drive lead, and nobody stated the stray capacitance there."""
+    return any(
+        channel == "I"
+        and not source.scene.states_stray_capacitance()
+        and source.scene.measurement.current_lead != "ground"
+        for source, channel in zip(sources, channels, strict=True)
+    )
+
+
+def estimate_stray_changes(channels: Collection[str], optimum: CircuitValues) -> dict[str, float]:
+    """Return the relative change of Rsc, Csc and Ci by a stray capacitance of `USUAL_STRAY`, with V and I alone.
+
+    It is empty for other channels, and for circuits with more than one time constant.
+    """
     terms = optimum.terms.get("I")
-    for source, trace in zip(sources, traces, strict=True):
-        measurement = source.scene.measurement
-        if trace.channel != "I" or source.scene.states_stray_capacitance() or measurement.current_lead == "ground":
-            continue
-        shift = ""
-        if terms is not None and terms.rate is not None and len(terms.tau) == 1 and terms.direct is None:
-            parts = float(terms.weight[0]), float(terms.tau[0])
-            pair = (skin_from_estimates(None, CurrentEstimate(*parts, float(terms.rate) - C)) for C in (0.0, usual))
-            now, then = pair
-            if now is not None and then is not None:
-                changes = (
-                    f"{name} by {100.0 * (b / a - 1.0):+.2g} %"
-                    for name, a, b in zip(FINGER_PARAMETERS, now, then, strict=True)
-                )
-                shift = f"; with V and I alone, {format_engineering(usual, 'F')} would change {', '.join(changes)}"
-        return [
-            "I in the drive lead contains the current of the stray capacitance of panel and cable, which the scene does"
-            f" not state{shift}; state [measurement] stray_capacitance, or take I in the ground lead (current_lead ="
-            " 'ground')"
-        ]
-    return []
+    if set(channels) != {"I"} or terms is None or terms.rate is None or len(terms.tau) != 1 or terms.direct is not None:
+        return {}
+    parts = float(terms.weight[0]), float(terms.tau[0])
+    now, then = (skin_from_estimates(None, CurrentEstimate(*parts, float(terms.rate) - C)) for C in (0.0, USUAL_STRAY))
+    if now is None or then is None:
+        return {}
+    return {name: b / a - 1.0 for name, a, b in zip(FINGER_PARAMETERS, now, then, strict=True)}
+
+
+def stray_note(changes: Mapping[str, float]) -> str:
+    """Return a note on a stray capacitance that nobody stated; `changes` as of `estimate_stray_changes`."""
+    shown = ", ".join(f"{name} by {100.0 * change:+.2g} %" for name, change in changes.items())
+    shift = f"; {format_engineering(USUAL_STRAY, 'F')} would change {shown}" if changes else ""
+    return (
+        "I in the drive lead contains the current of the stray capacitance of panel and cable, which the scene does not"
+        f" state{shift}; state [measurement] stray_capacitance, or take I in the ground lead (current_lead = 'ground')"
+    )
 
 
 def describe_assumed_Ci(scene: Scene | None, likelihood: Likelihood, prior_sets_Ci: bool) -> Remarks:

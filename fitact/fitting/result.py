@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from fitact import charts, summary
+from fitact import charts, result_text, summary
 from fitact.data.kramers_kronig import KramersKronig
 from fitact.data.record import Record, rounding_noise_sd
 from fitact.data.spectrum import Spectrum
@@ -17,14 +17,14 @@ from fitact.experiment.fisher import Experiment
 from fitact.fitting import derived
 from fitact.fitting.channel_fit import ChannelFit
 from fitact.fitting.effects import assess_fit, describe_alternatives, describe_structure
-from fitact.fitting.error_sources import geometry_component, structure_components
+from fitact.fitting.error_sources import geometry_component, structure_components, unstated_components
 from fitact.fitting.fit_figures import plot_fit, plot_identifiability
 from fitact.fitting.geometry import Contribution
 from fitact.fitting.identifiability import Identifiability, assess_identifiability, assess_parameters
 from fitact.fitting.laplace import Laplace
 from fitact.fitting.outcome import RESULTS
 from fitact.fitting.profile import PROFILE_QUANTITIES, Interval, profile_intervals
-from fitact.instrument.classes import TYPICAL, typical_gain_u
+from fitact.instrument.classes import TYPICAL, USUAL_STRAY, typical_gain_u
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import scale_information
 from fitact.model.circuit import FINGER_PARAMETERS
@@ -35,10 +35,10 @@ from fitact.problem.recorded_current import estimate_noise
 from fitact.problem.source import require_record
 from fitact.scene.assumptions import list_assumptions
 from fitact.scene.scene import Scene
-from fitact.tables import Display, join_lines, to_dataframe
+from fitact.tables import Display, to_dataframe
 from fitact.uncertainty.budget import Budget, ErrorSource, laplace_components
 from fitact.uncertainty.effect_size import NO_EFFECTS, EffectSizes
-from fitact.units import quantity_unit
+from fitact.units import format_engineering, quantity_unit
 
 _RESPONSE = {
     "constant": "exact",
@@ -64,6 +64,7 @@ class Fit(Display):
         error_sources: sources of error of each coordinate of theta.
         noise_information: root of the Fisher information of each source of noise.
         gain_shifts: change of theta for a relative error of 1 in the gain of V, Vsc or I that nobody stated.
+        stray_changes: relative changes of Rsc, Csc and Ci by a usual stray capacitance that nobody stated.
         misfit_effects: effects of what the model lacks, where the verdict needed them.
         kramers_kronig: the worst of the tests of the spectra; None without spectra.
     """
@@ -80,6 +81,7 @@ class Fit(Display):
     error_sources: tuple[tuple[ErrorSource, ...], ...]
     noise_information: dict[str, Float[np.ndarray, "rows parameters"]]
     gain_shifts: dict[str, Float[np.ndarray, " parameters"]]
+    stray_changes: dict[str, float]
     misfit_effects: EffectSizes | None = None
     kramers_kronig: KramersKronig | None = None
 
@@ -148,16 +150,21 @@ class Fit(Display):
         """Summarize a positive quantity, with the shape of the distributions of its sources of error."""
         result = summary.summarize_log_normal(name, value, log_sd)
         budget = self.budgets.get(name)
-        if budget is not None and math.isfinite(log_sd):
-            probabilities = summary.PROBABILITIES
-            factors = budget.quantiles(probabilities.values(), only_posterior=True)
-            result |= dict(zip(probabilities, (value * factors).tolist(), strict=True))
-        return result | {"u": log_sd if budget is None else budget.u}
+        if budget is None:
+            return result if name in self.assumed_quantities else result | {"u": log_sd}
+        if math.isfinite(log_sd):
+            result |= _scale_quantiles(value, budget, only_posterior=True)
+        combined = summary.summarize_log_normal(name, value, budget.combined.u)
+        if math.isfinite(budget.combined.u):
+            combined |= _scale_quantiles(value, budget.combined)
+        entry = summary.describe_combined(combined, budget.combined.u, budget.combined.origins())
+        return result | {"u": budget.u, "combined": entry}
 
     def parameters(self) -> dict[str, summary.Summary]:
         """Summarize the parameters in the Laplace approximation.
 
-        `u` is the combined relative standard uncertainty; `sd` is that of the posterior alone.
+        `sd` and the quantiles are those of the posterior alone, `u` is the relative standard uncertainty from all
+        stated sources, and `combined` has sd and quantiles with usual errors of what nobody stated, too.
 
         `contraction` is 1 - posterior sd / prior sd of the logarithm; `from_prior` is the fraction of the variance of
         the logarithm that comes from the prior.
@@ -241,8 +248,19 @@ class Fit(Display):
             # the scale of a force has the uncertainty of the force that it scales
             in_geometry = geometry["force_mean" if name == "force_scale" else name]
             others = (*map(geometry_component, in_geometry), *structure_components(self.effects, name))
-            budgets[name] = Budget((*components, *others))
+            sensitivities = self._unstated_sensitivities(name)
+            budgets[name] = Budget((*components, *others), unstated_components(*sensitivities))
         return budgets
+
+    @property
+    def assumed_quantities(self) -> tuple[str, ...]:
+        """Quantities of the friction that rest on defaults, or on a force sensor of which nobody stated the error."""
+        friction = [each for each in self.force_basis["assumptions"] if each["affects"] == "friction"]
+        is_default = any(each["origin"] == "default" for each in friction)
+        is_assumed = is_default and not any(each["has_distribution"] for each in friction)
+        if "mu" in self.names:
+            return ("mu", "friction_mean") * (is_assumed or not self.scene.instrument.pieces("Ft"))
+        return ("friction_mean",) * is_assumed
 
     @functools.cached_property
     def _gradients(self) -> dict[str, Float[np.ndarray, " parameters"]]:
@@ -251,23 +269,42 @@ class Fit(Display):
         moments = self.laplace.approximate_derived()
         derivatives = zip(derived.DERIVED_NAMES, moments.gradients, strict=True)
         names = (*FINGER_PARAMETERS, "force_scale")
-        return {name: gradients[name] for name in names if name in gradients} | dict(derivatives)
+        found = {name: gradients[name] for name in names if name in gradients} | dict(derivatives)
+        return {name: gradient for name, gradient in found.items() if name not in self.assumed_quantities}
 
-    def calibration_entry(self, name: str) -> dict[str, Any]:
-        """Return `stated` and `not_stated` of the budget of a quantity: gain errors that nobody stated."""
+    def _unstated_sensitivities(self, name: str) -> tuple[dict[str, float], float]:
+        """Return what errors that nobody stated change in the logarithm of a quantity.
+
+        The first is its derivative in the logarithm of each channel's gain, the second its change by a usual stray
+        capacitance.
+        """
         section, measurement = self.scene.instrument, self.scene.measurement
         stated = {"Vsc": measurement.gain_relative_sd > 0.0, "I": measurement.gain_I_relative_sd > 0.0}
-        gradient, entries = self._gradients[name], []
+        gradient, gains = self._gradients[name], {}
         for channel, shift in self.gain_shifts.items():
             if section.pieces(channel) or stated.get(channel) or (channel == "Z" and section.pieces("I")):
                 continue
             # the force is computed from V, beside the parameters that follow from it
             direct = 2.0 if channel == "V" and name in derived.DERIVED_NAMES and name.startswith("force") else 0.0
-            u = typical_gain_u(channel)
-            typical = " and ".join(TYPICAL[channel])
-            entries.append({"source": f"{channel} gain", "typical": typical, "input_u": u})
-            entries[-1]["u"] = abs(float(gradient @ shift) + direct) * u
-        return {"stated": section.is_stated, "not_stated": entries}
+            gains[channel] = float(gradient @ shift) + direct
+        changes = dict(zip(self.names, gradient, strict=True))
+        stray = sum(math.log1p(size) * changes.get(other, 0.0) for other, size in self.stray_changes.items())
+        return gains, stray
+
+    def calibration_entry(self, name: str) -> dict[str, Any]:
+        """Return `stated` and `not_stated` of the budget of a quantity: usual errors that nobody stated."""
+        gains, stray = self._unstated_sensitivities(name)
+        entries: list[dict[str, Any]] = []
+        for channel, sensitivity in gains.items():
+            input_u, typical = typical_gain_u(channel), " and ".join(TYPICAL[channel])
+            u = abs(sensitivity) * input_u
+            entries.append({"source": f"{channel} gain", "typical": typical, "input_u": input_u, "u": u})
+        if stray:
+            typical = f"0 to {format_engineering(USUAL_STRAY, 'F')}"
+            input_u = 3.0**-0.5
+            u = abs(stray) * input_u
+            entries.append({"source": "stray capacitance", "typical": typical, "input_u": input_u, "u": u})
+        return {"stated": self.scene.instrument.is_stated, "not_stated": entries}
 
     def unchanged_force_u(self) -> tuple[float, float, str]:
         """Return u of the log mean force from what no suggested measurement changes, now and after it, and the sources.
@@ -280,7 +317,7 @@ class Fit(Display):
         unstated = math.hypot(*(each["u"] for each in missing))
         sources = ["thickness, area and friction"] if geometry else []
         if missing:
-            sources.append(f"usual gain errors of {' and '.join(each['source'][:-5] for each in missing)}")
+            sources.append(f"usual errors of {' and '.join(each['source'] for each in missing)}")
         if V:
             sources.append("the gain of V")
         return math.hypot(geometry, unstated), math.hypot(geometry, unstated, V), " and ".join(sources)
@@ -403,7 +440,7 @@ class Fit(Display):
 
     def plot_budget(self) -> Any:
         """Draw the largest components of each quantity's combined uncertainty, and return the axes."""
-        return np.array(charts.draw_budgets(self.budget_entries(), make=charts.pyplot_figure).axes)
+        return np.array(charts.draw_budgets(self.to_dict(), make=charts.pyplot_figure).axes)
 
     def plot_identifiability(self, ax: Any = None) -> Any:
         """Draw the 95 % regions of two parameters before and after the data, in the Laplace approximation.
@@ -421,23 +458,19 @@ class Fit(Display):
 
     @property
     def _headline(self) -> str:
-        values, sd = self.likelihood.to_physical(self.theta), dict(zip(self.names, self.sd, strict=True))
-        estimates = {
-            name: summary.summarize_log_normal(name, float(values[name]), float(sd[name]))
-            for name in FINGER_PARAMETERS
-            if name in sd
-        }
+        values = self.likelihood.to_physical(self.theta)
+        estimates = {name: float(values[name]) for name in FINGER_PARAMETERS if name in self.names}
         first, others = os.path.basename(self.records[0].source), len(self.records) - 1
         source = f"{first} and {others} more" if others else first
         state = self.identifiability.verdict, "reliable" if self.trusted else f"unreliable ({self.result})"
-        return ", ".join((source, summary.format_estimates(estimates), *state))
+        return ", ".join((source, summary.format_values(estimates), *state))
 
     def _rows(self) -> list[tuple[str, ...]]:
         content = {"parameters": self.parameters(), "derived": self.derived(), "force_basis": self.force_basis}
-        return summary.quantity_table(content)
+        return result_text.estimate_table(content)
 
     def _sentences(self) -> list[str]:
-        law = summary.force_sentences(self.force_basis)[0]
+        law = result_text.force_sentences(self.force_basis)[0]
         share = 100.0 * self.identifiability.force_from_prior
         return [self.message, f"The prior contributes {share:.3g} % of the variance of the force.", law]
 
@@ -519,8 +552,11 @@ class Fit(Display):
                     found[name + suffix] = {"sd": sd, "rounding": rounding, "source": "estimated"}
         return found
 
-    def summary(self) -> str:
-        """Return a table for people: estimates with errors, what the force rests on, and the verdict."""
+    def summary(self, *, verbose: bool = False) -> str:
+        """Return the main results for people, or all of them: estimates, verdict and what to do next."""
+        content = self.to_dict()
+        if not verbose:
+            return result_text.describe_result(content, self.scene.description)
         names, correlation = list(self.identifiability.blind_direction), self.correlation
         places = [self.names.index(name) for name in names]
         pairs = [
@@ -528,15 +564,18 @@ class Fit(Display):
             for i in range(len(names))
             for j in range(i)
         ]
-        chi_square, content = self.figures["chi2_reduced"], self.to_dict()
-        rows = [
-            *summary.format_table(content),
+        details = [
             f"Correlations of the log-parameters: {', '.join(pairs)}.",
-            f"Residual variance / model-free noise variance: {chi_square:.3f}. {self.message}",
+            f"Residual variance / model-free noise variance: {self.figures['chi2_reduced']:.3f}. {self.message}",
             f"Log-likelihood: {self._likelihood()}.",
             str(self.identifiability),
-            *summary.advice_line(content),
         ]
-        return join_lines(rows, self.warnings, content["notes"])
+        return result_text.describe_fully(content, details)
 
     __str__ = summary
+
+
+def _scale_quantiles(value: float, budget: Budget, *, only_posterior: bool = False) -> dict[str, float]:
+    """Return the quantiles of a quantity by name, from its estimate and its budget."""
+    factors = budget.quantiles(summary.PROBABILITIES.values(), only_posterior=only_posterior)
+    return dict(zip(summary.PROBABILITIES, (value * factors).tolist(), strict=True))

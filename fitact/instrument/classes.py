@@ -62,7 +62,15 @@ TYPICAL = {
 }
 
 
+# largest stray capacitance of panel and cable that is usual, F
+USUAL_STRAY = 100e-12
+
+
+def typical_gains(channel: str) -> dict[str, float]:
+    """Return the limits of the relative gain error of a channel's `TYPICAL` equipment, by class."""
+    return {name: gain for name in TYPICAL[channel] if (gain := CLASSES[name].gain)}
+
+
 def typical_gain_u(channel: str) -> float:
     """Return the relative standard uncertainty of the gain of a channel with `TYPICAL` equipment."""
-    limits = (CLASSES[name].gain or 0.0 for name in TYPICAL[channel])
-    return math.hypot(*limits) / math.sqrt(3.0)  # of uniform distributions
+    return math.hypot(*typical_gains(channel).values()) / math.sqrt(3.0)  # of uniform distributions

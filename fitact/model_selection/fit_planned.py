@@ -30,6 +30,11 @@ class PlannedFit:
     sentence: str  # reason for the choice, and the error that it causes
     plan: Plan | None = None  # None if nothing was planned
 
+    @property
+    def omits_elements(self) -> bool:
+        """Whether elements of the scene are neglected."""
+        return self.model == "planned" and self.plan is not None and bool(self.plan.left_out)
+
     def to_dict(self) -> dict[str, Any]:
         """Return the entry `plan` of fit.json and summary.json."""
         entry = {"used": self.model, "sentence": self.sentence}

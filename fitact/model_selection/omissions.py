@@ -35,8 +35,7 @@ FLOAT32_SPEEDUP = 1.6  # measured by benchmarks/plan.py for many circuits in one
 class _Costs:
     """Cost in nanoseconds per sample for many circuits in one compiled program; one exponential takes about 1 ns.
 
-    The values were measured once by benchmarks/plan.py, so that a plan does not depend on the load of a machine;
-    docs/plan.md has the table.
+    The values were measured once by benchmarks/plan.py, so that a plan does not depend on the load of a machine.
     """
 
     lookup: float = 1.0  # locating a time in the drive

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitact import charts, summary
+from fitact import charts, result_text, summary
 from fitact.compiled import BatchEvaluator, jit
 from fitact.data.study import Nesting
 from fitact.files import atomic_write
@@ -483,7 +483,7 @@ class Population(Display):
 
     @property
     def _force_law(self) -> str:
-        return f"computed {summary.FORCE_LAWS[self.scene.force.model]} and not measured"
+        return f"computed {result_text.FORCE_LAWS[self.scene.force.model]} and not measured"
 
     @property
     def _headline(self) -> str:

@@ -15,20 +15,22 @@ from fitact.errors import InputError
 from fitact.files import read_datatree
 from fitact.report.frame import image, write_page
 from fitact.report.posterior import make_charts
-from fitact.scene.diagrams import scene_circuit, scene_wiring
-from fitact.scene.scene import Scene
-from fitact.summary import (
+from fitact.result_text import (
     FORCE_LAWS,
     blind_table,
     budget_sentence,
     budget_table,
-    format_estimate,
-    format_interval,
-    load,
+    describe_sources,
+    next_measurements,
+    next_step,
     quantity_table,
     result_names,
     result_sentences,
+    verdict_sentence,
 )
+from fitact.scene.diagrams import scene_circuit, scene_wiring
+from fitact.scene.scene import Scene
+from fitact.summary import format_estimate, format_interval, is_trusted, load
 from fitact.what_now import explain
 
 _CIRCUITS = {
@@ -56,15 +58,20 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
             drawings=(scene_circuit(scene, summary["parameters"]), *wirings),
             table=quantity_table(summary),
             panels=_panels(summary["fit"]["traces"]),
-            budgets=[budget_table(name, entry) for name, entry in summary["budget"].items()],
+            budgets=[budget_table(name, summary) for name in summary["budget"]],
+            verdict=verdict_sentence(summary),
+            next_step=next_step(summary),
+            measurements=next_measurements(summary),
             blind=blind_table(summary),
             budget_note=budget_sentence(summary),
-            budget_picture=image(lambda: draw_budgets(summary["budget"])),
+            budget_picture=image(lambda: draw_budgets(summary)),
             force=result_sentences(summary),
             law=f"computed {FORCE_LAWS[summary['force_basis']['law']]}",
             circuits=_CIRCUITS,
             estimate=format_estimate,
             interval=format_interval,
+            sources=describe_sources,
+            trusted=is_trusted(summary),
             advice=[Markup(MarkdownIt("js-default").render(explain(name))) for name in result_names(summary)],
             command=_command(summary),
             scene=json.dumps(summary["scene"], indent=2, ensure_ascii=False),

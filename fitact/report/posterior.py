@@ -23,7 +23,9 @@ def make_charts(tree: Any, page_columns: int = 10_000) -> dict[str, Chart]:
         axis: _spectrum_chart(tree, axis) if axis.startswith("frequency") else _record_chart(tree, axis, columns)
         for axis in axes
     }
-    draws, prior = ({str(name): x.values for name, x in tree[g].items()} for g in ("posterior", "prior"))
+    groups = "posterior", "combined", "prior"
+    posterior, combined, prior = ({str(name): x.values for name, x in tree[g].items()} for g in groups)
+    draws = posterior | combined
     marginals, pairs = corner_plots(draws, prior, FINGER_PARAMETERS)
     switch = interactive.log_axis_button(marginals, label="logarithmic axes")
     switch["updates"] += interactive.log_axis_button(pairs, "xy")["updates"] if pairs else []

@@ -6,13 +6,14 @@ import functools
 import importlib.metadata
 import math
 import os
+from collections import defaultdict
 from typing import Any, Protocol, Self
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from fitact import charts, summary
+from fitact import charts, result_text, summary
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
@@ -184,13 +185,16 @@ class Posterior(Display):
         summaries = {name: summary.summarize_draws(name, draws) for name, draws in (drawn | self.derived()).items()}
         for name, fitted in (self.fit.parameters() | self.fit.derived()).items():
             summaries[name]["from_prior"] = fitted["from_prior"]
-        budgets = self._budgets
         for name, draws in (drawn | self.derived()).items():
             mean, sd = float(np.mean(draws)), float(np.std(draws, ddof=1))
-            relative = sd / abs(mean) if mean else math.inf
-            # the felt friction is proportional to the force, whose other sources of error it shares
-            budget = budgets.get("force_mean" if name == "times_threshold" else name)
-            summaries[name]["u"] = relative if budget is None else budget.u
+            budget = self._budgets.get(_budget_name(name))
+            if budget is not None:
+                combined = summary.summarize_draws(name, self.combined_draws[name])
+                summaries[name]["u"] = budget.u
+                sizes = budget.combined.u, budget.combined.origins()
+                summaries[name]["combined"] = summary.describe_combined(combined, *sizes)
+            elif name not in self.fit.assumed_quantities:
+                summaries[name]["u"] = sd / abs(mean) if mean else math.inf
         for name, prior_sd in zip(prior.names, prior.log_sd, strict=True):
             summaries[name]["contraction"] = float(1.0 - np.std(np.log(drawn[name]), ddof=1) / prior_sd)
         for name, law in self.fit.laplace.geometry.stated.items():
@@ -203,7 +207,7 @@ class Posterior(Display):
             "fit": self.fit.judgement(),
             "model": self.fit.model(),
             "force_basis": self.fit.force_basis,
-            **({} if self.sensation is None else {"sensation": self.sensation.to_dict()}),
+            **self._describe_sensation(),
             "budget": self._budget_entries(),
             **self.fit.effects.to_dict(),
             **self.fit.validity(),
@@ -215,6 +219,15 @@ class Posterior(Display):
             "versions": summary.versions(),
         }
 
+    def _describe_sensation(self) -> dict[str, Any]:
+        """Return `sensation` of summary.json, with the combined uncertainty of the force."""
+        felt = self.sensation
+        if felt is None:
+            return {}
+        if felt.times_threshold is not None:
+            felt = dataclasses.replace(felt, times_threshold=self.combined_draws["times_threshold"])
+        return {"sensation": felt.to_dict()}
+
     @functools.cached_property
     def _budgets(self) -> dict[str, Budget]:
         """Budgets of the fit, with the standard deviations of the draws."""
@@ -222,11 +235,26 @@ class Posterior(Display):
         budgets = self.fit.budgets.items()
         return {name: each.scale_posterior(float(np.std(np.log(draws[name]), ddof=1))) for name, each in budgets}
 
+    @functools.cached_property
+    def _other_deviates(self) -> defaultdict[str, Float[np.ndarray, "ensembles draws"]]:
+        """Standard normal numbers of each source of error beyond the posterior, made when first used."""
+        rng, shape = np.random.default_rng([self.seed, 5]), self.points.shape[:2]
+        return defaultdict(lambda: rng.standard_normal(shape))
+
+    @functools.cached_property
+    def combined_draws(self) -> dict[str, Float[np.ndarray, "ensembles draws"]]:
+        """Draws of the quantities with a budget, with all sources of error in it, also usual ones not stated."""
+        return {
+            name: draws * self._budgets[_budget_name(name)].combined.draw_others(self._other_deviates)
+            for name, draws in (self.parameters() | self.derived()).items()
+            if _budget_name(name) in self._budgets
+        }
+
     def _budget_entries(self) -> dict[str, Any]:
         """Return `budget` of summary.json; its intervals come from the draws."""
         draws, entries = self.parameters() | self.derived(), {}
         for name, each in self._budgets.items():
-            factors = each.draw_others(np.random.default_rng([self.seed, 5]), draws[name].shape)
+            factors = each.draw_others(self._other_deviates)
             low, high = np.quantile(draws[name] * factors, (0.025, 0.975)).tolist()
             entries[name] = each.to_dict(float(np.median(draws[name])), (low, high)) | self.fit.calibration_entry(name)
         return entries
@@ -241,12 +269,16 @@ class Posterior(Display):
         }
 
     def __str__(self) -> str:
-        return summary.table(self._summary)
+        return result_text.describe_summary(self._summary)
 
     def plot(self) -> Any:
-        """Draw parameters (with their prior), pairs of Rsc, Csc and Ci, and the force, and return the axes."""
-        pages = charts.corner_plots(self.parameters(), self._prior_draws, FINGER_PARAMETERS)
-        return charts.show_plots(*pages[0], *pages[1], *charts.force_plots(self.force()), caption=self._force_law)
+        """Draw parameters (with their prior), pairs of Rsc, Csc and Ci, and the force, and return the axes.
+
+        Quantities with a budget are drawn with their combined uncertainty.
+        """
+        draws = self.parameters() | self.combined_draws
+        pages = charts.corner_plots(draws, self._prior_draws, FINGER_PARAMETERS)
+        return charts.show_plots(*pages[0], *pages[1], *charts.force_plots(draws), caption=self._force_law)
 
     def plot_force(self, ax: Any = None) -> Any:
         """Draw the force over time with its 90 % interval, and return the axes."""
@@ -256,18 +288,18 @@ class Posterior(Display):
 
     def plot_budget(self) -> Any:
         """Draw the largest components of each quantity's combined uncertainty, and return the axes."""
-        return np.array(charts.draw_budgets(self._budget_entries(), make=charts.pyplot_figure).axes)
+        return np.array(charts.draw_budgets(self._summary, make=charts.pyplot_figure).axes)
 
     @property
     def _force_law(self) -> str:
-        return summary.force_sentences(self.fit.force_basis)[0]
+        return result_text.force_sentences(self.fit.force_basis)[0]
 
     @functools.cached_property
     def force_in_time(self) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "quantiles times"]]:
         """Times (s), and the quantiles 2.5, 5, 25, 50, 75, 95 and 97.5 % of the force (N) at each.
 
         The times are one period of a stated drive, the last two of a measured one, or the whole of an aperiodic one.
-        The force is that of `force()`, for up to 100 draws of each ensemble.
+        The force is that of `force()` for up to 100 draws of each ensemble, with its combined uncertainty.
         """
         first = self.fit.records[0]
         frequency = None if isinstance(first, Spectrum) else first.frequency()
@@ -277,6 +309,12 @@ class Posterior(Display):
         time, force = derived.draw_force(self.fit.derive, self.fit.likelihood, *chosen, span)
         mean = derived.DERIVED_NAMES.index("force_mean")
         force *= (self._derived_draws[:, draws, mean] / self._nominal_draws[:, draws, mean])[..., None]
+        # other sources of error at even probabilities, since few draws of a wide factor would move the median
+        others = self.combined_draws["force_mean"] / self._derived_draws[..., mean]
+        even = np.quantile(
+            others, (np.arange(force.shape[0] * force.shape[1]) + 0.5) / (force.shape[0] * force.shape[1])
+        )
+        force *= np.random.default_rng([self.seed, 6]).permutation(even).reshape(*force.shape[:2], 1)
         return time, np.quantile(force.reshape(-1, time.size), list(summary.PROBABILITIES.values()), axis=0)
 
     def to_dataframe(self) -> Any:
@@ -299,12 +337,12 @@ class Posterior(Display):
     @property
     def _headline(self) -> str:
         values = self.fit.likelihood.to_physical(self.points[..., : self.fit.theta.size])
-        estimates = {name: summary.summarize_draws(name, values[name]) for name in FINGER_PARAMETERS if name in values}
+        estimates = {name: float(np.median(values[name])) for name in FINGER_PARAMETERS if name in values}
         state = self.fit.identifiability.verdict, "reliable" if self.trusted else "unreliable"
-        return ", ".join((self._record()["source"], summary.format_estimates(estimates), *state))
+        return ", ".join((self._record()["source"], summary.format_values(estimates), *state))
 
     def _rows(self) -> list[tuple[str, ...]]:
-        return summary.quantity_table(self._summary)
+        return result_text.estimate_table(self._summary)
 
     def _sentences(self) -> tuple[str, ...]:
         return str(self.convergence), self._force_law
@@ -354,6 +392,7 @@ class Posterior(Display):
             {
                 "/": to_dataset({}, attributes=attributes),
                 "posterior": dataset(self.parameters() | self.derived()),
+                "combined": dataset(self.combined_draws),
                 "sample_stats": statistics,
                 "posterior_predictive": self._posterior_predictive,
                 "observed_data": to_dataset(observed, axes),
@@ -421,6 +460,11 @@ class Posterior(Display):
 
         stated = {} if plan is None else {"plan": {"used": "planned", "sentence": plan.sentence} | plan.to_dict()}
         write_report(path, self.to_datatree(), self.summary() | stated)
+
+
+def _budget_name(name: str) -> str:
+    """Return the quantity whose budget holds for `name`: the felt friction is proportional to the force."""
+    return "force_mean" if name == "times_threshold" else name
 
 
 def convert_to_arviz(tree: Any) -> Any:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fitact import charts, summary
+from fitact import charts, result_text
 from fitact.files import write_parquet
 from fitact.fitting.result import Fit
 from fitact.tables import Display, align_table, join_lines, to_dataframe
@@ -90,7 +90,7 @@ class Track(Display):
         """
         columns = self.to_columns()
         plots = [charts.track_plot(columns, name, self.jumps) for name in names or self.values]
-        return charts.show_plots(*plots, ax=ax, caption=summary.force_sentences(self.fit.force_basis)[0])
+        return charts.show_plots(*plots, ax=ax, caption=result_text.force_sentences(self.fit.force_basis)[0])
 
     @functools.cached_property
     def within_finger(self) -> dict[str, dict[str, float]]:
@@ -183,7 +183,7 @@ class Track(Display):
         return rows
 
     def _sentences(self) -> list[str]:
-        return [self.fit.message, summary.force_sentences(self.fit.force_basis)[0]]
+        return [self.fit.message, result_text.force_sentences(self.fit.force_basis)[0]]
 
     def __str__(self) -> str:
         rows = self._rows()

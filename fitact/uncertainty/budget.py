@@ -28,6 +28,7 @@ class ErrorSource:
     reduce_by: str = ""  # cheapest way to reduce it
     power: float = 1.0  # of the factor in the parameter
     is_shared: bool = False  # whether it is the same error in all records of a session
+    origin: str = ""  # see `Component`
 
     @functools.cached_property
     def u(self) -> float:
@@ -47,6 +48,7 @@ class Component:
     reduce_by: str = ""
     in_posterior: bool = True  # whether the posterior includes it
     is_shared: bool = False  # whether it is the same error in all records of a session
+    origin: str = ""  # what it comes from in a few words, such as "data" or "default Tsc"; "" means its source
 
     @property
     def u(self) -> float:
@@ -56,14 +58,34 @@ class Component:
 
 @dataclasses.dataclass(frozen=True)
 class Budget:
-    """Sources of the uncertainty of one quantity."""
+    """Sources of the uncertainty of one quantity.
+
+    Attributes:
+        components: sources in the posterior, in what force and friction rest on, and in the structure of residuals.
+        unstated: usual errors of instruments that nobody stated.
+    """
 
     components: tuple[Component, ...]
+    unstated: tuple[Component, ...] = ()
 
     @property
     def u(self) -> float:
-        """Combined standard uncertainty of the logarithm of the quantity."""
+        """Standard uncertainty of the logarithm of the quantity from `components`."""
         return math.hypot(*(component.u for component in self.components))
+
+    @functools.cached_property
+    def combined(self) -> "Budget":
+        """Budget in which the unstated errors are components, as one would sign it."""
+        return Budget((*self.components, *self.unstated))
+
+    def origins(self) -> dict[str, float]:
+        """Return the fractions of the variance by what they come from, largest first."""
+        parts: dict[str, float] = {}
+        for each in self.components:
+            name = each.origin or each.source
+            parts[name] = parts.get(name, 0.0) + each.u**2
+        total = sum(parts.values())
+        return {name: x / total for name, x in sorted(parts.items(), key=lambda item: -item[1]) if x > 0.0}
 
     def scale_posterior(self, log_sd: float) -> "Budget":
         """Return the budget with the posterior's components scaled to the standard deviation `log_sd` of its draws."""
@@ -73,7 +95,7 @@ class Budget:
             dataclasses.replace(each, sensitivity=factor * each.sensitivity) if each.in_posterior else each
             for each in self.components
         )
-        return Budget(tuple(scaled))
+        return Budget(tuple(scaled), self.unstated)
 
     def subtract(self, other: "Budget") -> "Budget":
         """Return the budget of the ratio to another quantity of the same session, in which shared errors cancel."""
@@ -87,15 +109,17 @@ class Budget:
         rows += [dataclasses.replace(each, sensitivity=-each.sensitivity) for each in rest]
         return Budget(tuple(rows))
 
-    def draw_others(self, rng: np.random.Generator, shape: tuple[int, ...]) -> Float[np.ndarray, "*shape"]:
-        """Return draws of the factor by which the sources beyond the posterior change the quantity."""
-        logs = np.zeros(shape)
+    def draw_others(self, deviates: Mapping[str, Float[np.ndarray, "*shape"]]) -> Float[np.ndarray, "*shape"]:
+        """Return draws of the factor by which the sources beyond the posterior change the quantity.
+
+        `deviates` are standard normal numbers by source, so that quantities with the same source change together.
+        """
+        logs: Any = 0.0
         for each in self.components:
             if not each.in_posterior:
-                z = rng.standard_normal(shape)
-                x = each.distribution
+                z, x = deviates[each.source], each.distribution
                 deviation = each.input_u * z if x is None else np.asarray(x.from_standard_normal(z)) - x.log_mean
-                logs += each.sensitivity * deviation
+                logs = logs + each.sensitivity * deviation
         return np.exp(logs)
 
     def quantiles(self, probabilities: Iterable[float], *, only_posterior: bool = False) -> Float[np.ndarray, " n"]:
@@ -179,13 +203,14 @@ def laplace_components(
             u = each.u * math.sqrt(variance / stated)  # larger than its own in a fit without prior
             # the product and each of its factors have the same sensitivity
             sensitivity = float(each.power * part[0] / variance)
-            known = each.distribution, each.reduce_by
-            components.append(Component(each.name, "B", u, sensitivity, *known, is_shared=each.is_shared))
+            known = each.distribution, each.reduce_by, True, each.is_shared, each.origin
+            components.append(Component(each.name, "B", u, sensitivity, *known))
     return tuple(components)
 
 
 def _noise_component(name: str, u: float) -> Component:
-    return Component(name, "A", u, 1.0, None, "record longer: four times as much data halves it")
+    remedy = "record longer: four times as much data halves it"
+    return Component(name, "A", u, 1.0, None, remedy, origin="data")
 
 
 def _independent_blocks(precision: Float[np.ndarray, "n n"]) -> list[list[int]]:

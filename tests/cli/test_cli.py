@@ -88,7 +88,7 @@ def test_run_leaves_everything_and_says_what_to_open(results):
     folder, done = results
     assert done.returncode == 0, done.stderr
     assert {path.name for path in folder.iterdir()} == FILES  # nothing half-written
-    assert done.stdout.strip().splitlines()[-1] == f"open {folder / 'report.html'}"
+    assert done.stdout.strip().splitlines()[-1] == f"open {folder / 'report.html'} (more here: --verbose)"
     assert "sampling" in done.stderr
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["identifiability"]["verdict"] == "prior-limited"
@@ -139,7 +139,7 @@ def test_summary_is_printed_again_with_the_runs_exit_code(results, fitact_proces
     folder, done = results
     again = fitact_process("summary", folder)
     assert again.returncode == 0
-    assert done.stdout == again.stdout + f"open {folder / 'report.html'}\n"
+    assert done.stdout == again.stdout + f"open {folder / 'report.html'} (more here: --verbose)\n"
     content = json.loads(fitact_process("summary", folder, "--json").stdout)
     assert content == json.loads((folder / "summary.json").read_text())
     content["convergence"]["converged"] = False

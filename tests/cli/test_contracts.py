@@ -25,7 +25,22 @@ TYPES: dict[str, tuple[type, ...]] = {
     "list": (list,),
     "object": (dict, type(None)),
 }
-SUMMARY = ("unit", "mean", "sd", "q025", "q05", "q25", "q50", "q75", "q95", "q975", "contraction", "from_prior", "u")
+SUMMARY = (
+    "unit",
+    "mean",
+    "sd",
+    "q025",
+    "q05",
+    "q25",
+    "q50",
+    "q75",
+    "q95",
+    "q975",
+    "contraction",
+    "from_prior",
+    "u",
+    "combined",
+)
 
 
 class Stated(NamedTuple):
@@ -49,17 +64,14 @@ def stated(command: str) -> list[Stated]:
         for key in re.findall(r"`(.+?)`", keys):
             always = not meaning.startswith("where ")
             if types == "summary":
-                found += [
-                    Stated(f"{key}.{name}", _part(name), always and name not in ("contraction", "from_prior", "u"))
-                    for name in SUMMARY
-                ]
+                found += [Stated(f"{key}.{name}", _part(name), always and name not in SUMMARY[10:]) for name in SUMMARY]
             else:
                 found.append(Stated(key, types, always))
     return found
 
 
 def _part(name: str) -> str:
-    return "text" if name == "unit" else "number"
+    return {"unit": "text", "combined": "object"}.get(name, "number")
 
 
 def leaves(path: str, value: Any, known: list[Stated]):

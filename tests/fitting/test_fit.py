@@ -234,7 +234,7 @@ def test_the_users_precision_is_left_alone_and_does_not_matter(finger_fit, x64: 
 
 
 def test_it_prints_errors_correlations_and_the_verdict(finger_fit: fitact.Fit):
-    text = str(finger_fit)
+    text = finger_fit.summary(verbose=True)
     for word in ("Rsc", "Csc", "Ci", "Correlations", "prior-limited", "contact area", "Residual variance"):
         assert word in text
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fitact
-from fitact.summary import force_sentences, quantity_table
+from fitact.result_text import force_sentences, quantity_table
 from tests.conftest import RECORDS, square_record
 
 MEASURED = '[drive]\nwaveform = "measured"\n'
@@ -31,7 +31,7 @@ def test_each_value_that_nobody_stated_is_marked_as_a_default(tmp_path):
         "Ci": "default", "relative sd of Ci": "default", "Ti": "default", "Tsc": "scene", "mu": "default",
         "fN": "scene",
     }  # fmt: skip
-    text = str(fit)
+    text = fit.summary(verbose=True)
     assert "it was not measured, and these data do not test that law" in text
     assert "Tsc = 100 µm (scene), mu = 0.5 (default), fN = 1 N (scene)" in text
     assert json.loads(json.dumps(fit.to_dict()))["force_basis"] == json.loads(json.dumps(fit.force_basis))
@@ -56,7 +56,7 @@ def test_the_force_by_the_other_law_is_that_of_a_fit_by_it(tmp_path):
         assert law["force_mean"]["sd"] == pytest.approx(other.derived()["force_mean"]["sd"], rel=1e-4)
     # F = eps0 A Vgap^2 / (2 d^2), and Vgap = Vsc (Csc / Cgap) at high frequency bounds the order of magnitude
     assert by_gap.derived()["force_mean"]["q50"] > 1e3 * by_paper.derived()["force_mean"]["q50"]
-    assert "Mean force by the other law" in str(by_paper)
+    assert "Mean force by the other law" in by_paper.summary(verbose=True)
 
 
 def test_without_a_gap_there_is_no_other_law(finger_fit: fitact.Fit):
@@ -113,7 +113,9 @@ def test_the_fraction_from_the_prior_is_that_of_the_information(finger_fit: fita
 def test_friction_of_defaults_has_no_five_digits(finger_fit: fitact.Fit, tmp_path):
     row = next(row for row in quantity_table(finger_fit.to_dict()) if row[0] == "friction_mean")
     assert row[1] == "about 250 mN"
-    assert row[5].endswith("default mu = 0.5, fN = 500 mN")
+    assert row[5] == "default mu, default fN"
+    assert "friction_mean" not in finger_fit.to_dict()["budget"]  # nobody measured it
+    assert "u" not in finger_fit.derived()["friction_mean"]
     stated = fit_with(MEASURED + '[friction]\ncoefficient = 0.4\nnormal_force = "1 N"\n', tmp_path)
     row = next(row for row in quantity_table(stated.to_dict()) if row[0] == "friction_mean")
     assert "±" in row[1]

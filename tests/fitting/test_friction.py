@@ -13,6 +13,7 @@ from fitact.data.simulate import simulate as simulate_scene
 from fitact.design.measurement import experiment_from_scene
 from fitact.errors import InputError
 from fitact.fitting.sensation import FeltDrive
+from fitact.result_text import estimate_table
 
 SCENE = """
 [measurement]
@@ -91,10 +92,11 @@ def test_friction_determines_what_the_electrical_channels_do_not(tmp_path: Path)
 def test_tables_say_whether_the_law_holds(tmp_path: Path) -> None:
     record, text = simulate(tmp_path, "[friction]\nforce_scale = 3.0\n")
     fit = fitact.fit(record, load(tmp_path, text))
-    summary, content = " ".join(fit.summary().split()), fit.to_dict()
+    summary, content = " ".join(fit.summary(verbose=True).split()), fit.to_dict()
     assert "they differ, so the law, the contact area, a thickness or the normal force is wrong" in summary
     assert "do not test that law" not in summary
     assert content["force_basis"]["tested_by_data"]
+    assert ("mu", "about 0.6", "", "unstated sensor", "coefficient of friction mu") in estimate_table(content)
     # the thickness of the skin, which nobody stated, is as uncertain for the scale as for the force
     u = {
         name: content["parameters" if name == "force_scale" else "derived"][name]["u"]
@@ -102,7 +104,7 @@ def test_tables_say_whether_the_law_holds(tmp_path: Path) -> None:
     }
     assert u["force_scale"] == pytest.approx(u["force_mean"], rel=0.02)
     agreeing = fitact.fit(simulate(tmp_path)[0], load(tmp_path, text))
-    assert "they agree" in " ".join(agreeing.summary().split())
+    assert "they agree" in " ".join(agreeing.summary(verbose=True).split())
     assert agreeing.to_dict()["derived"]["friction_mean"]["q50"] == pytest.approx(0.6 * (0.5 + 271e-6), rel=1e-3)
 
 

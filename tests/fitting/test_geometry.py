@@ -11,7 +11,7 @@ import scipy.stats
 import fitact
 from fitact.data.simulate import simulate
 from fitact.fitting.geometry import Capacitances, UncertainGeometry
-from fitact.summary import force_sentences
+from fitact.result_text import force_sentences
 from fitact.units import format_engineering
 from tests.conftest import RECORDS
 
@@ -223,9 +223,10 @@ def test_what_changes_nothing_is_noted_once(plain_fit: fitact.Fit, uncertain_fit
 
 
 def test_the_sentence_names_the_distributions_that_the_errors_include(plain_fit: fitact.Fit, uncertain_fit: fitact.Fit):
-    assert "except the prior's and the stated distributions (Tsc, mu)." in force_sentences(uncertain_fit.force_basis)[1]
-    assert "except the prior's." in force_sentences(plain_fit.force_basis)[1]
-    assert "Tsc = 200 µm ± 20 % (scene)" in str(uncertain_fit)
+    included = "includes that of the prior, of the stated distributions (Tsc, mu) and of Tsc"
+    assert included in force_sentences(uncertain_fit.force_basis)[1]
+    assert "includes that of the prior and of Tsc, but of no other" in force_sentences(plain_fit.force_basis)[1]
+    assert "Tsc = 200 µm ± 20 % (scene)" in uncertain_fit.summary(verbose=True)
 
 
 def test_an_assumed_distribution_is_listed_but_changes_no_error(plain_fit: fitact.Fit):

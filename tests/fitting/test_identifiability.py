@@ -64,8 +64,11 @@ def test_no_record_of_vsc_alone():
     assert found.structural
     text = str(found)
     assert "Vsc alone cannot determine the contact area" in text
-    assert "mean force: ± 4.9 % now. Expected after one change: ± 0.023 % with " in text
-    assert "± 4.9 % with four times " in text
+    assert "mean force: ± 4.9 % now. Expected after one change: ± 0.023 % with " in found.remedy
+    assert "± 4.9 % with four times " in found.remedy
+    assert "Expected" not in text  # a table has the figures
+    first = found.to_dict()["remedies"][0]
+    assert (first["u"], bool(first["needs"])) == (first["force_sd"], True)
     assert found.to_dict()["remedies"][0]["force_sd"] == found.remedies[0].force_sd
 
 

@@ -11,7 +11,7 @@ import scipy.stats
 
 import fitact
 from fitact.data.readers.read import write_csv
-from fitact.summary import budget_sentence, budget_text
+from fitact.result_text import budget_sentence, budget_text
 from tests import session_calibration as session
 
 PARTS = (150e3, 24e-9, 1.4e-9)  # Rsc, Csc, Ci
@@ -94,12 +94,18 @@ def test_an_error_that_nobody_states_is_named(change: dict[str, Any]):
     silent = fitact.fit(make(**change), plain())
     assert max(map(abs, errors_of(silent).values())) > 10.0  # far beyond noise and prior
     content = silent.to_dict()
-    assert budget_sentence(content).startswith("Uncertainties: noise and prior only; no instrument stated.")
-    assert "Vsc gain: not stated" in budget_text(content, ["g"])
+    assert "Not stated, so usual errors are included: V gain" in budget_sentence(content)
+    assert "Vsc gain, not stated (usual: scope-8bit and probe-10x)" in budget_text(content, ["g"])
     assert not content["budget"]["g"]["stated"]
     added = math.hypot(*(each["u"] for each in content["budget"]["g"]["not_stated"]))
     assert added == pytest.approx(math.sqrt(2.0 * (0.03**2 + 0.02**2) / 3.0), rel=1e-3)
-    assert str(silent).count("no instrument stated") == 1
+    # what one reads first includes usual errors, so that an error of this size is no surprise
+    assert content["derived"]["g"]["combined"]["u"] == pytest.approx(
+        math.hypot(added, content["derived"]["g"]["u"]), rel=1e-3
+    )
+    if "scope-8bit:A/CH2" in change:
+        off = math.log(content["derived"]["g"]["q50"] / fitact.fit(make(), plain()).derived()["g"]["q50"])
+        assert abs(off) < 2.0 * content["derived"]["g"]["combined"]["u"]
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import scipy.signal
 import scipy.stats
 
 import fitact
-from fitact.data.clipping import clipping_mask
+from fitact.data.clipping import clipping_mask, has_flat_levels
 from fitact.likelihood.noise import (
     Autoregression,
     draw_noise,
@@ -263,6 +263,19 @@ def test_a_smooth_peak_however_rounded_is_not_clipped(step: float):
     phase = 2.0 * np.pi * np.arange(4000) / 2000.0
     assert not clipping_mask(np.round(23.0 * np.sin(phase) / step) * step).any()
     assert not clipping_mask(np.where(phase % 6.0 < 3.0, 1.0, -1.0)).any()
+
+
+@pytest.mark.parametrize("step", [0.0, 3.0])
+@pytest.mark.parametrize("duty", [0.1, 0.5])
+def test_a_square_with_finite_edges_without_noise_or_rounded_above_it_is_not_clipped(step: float, duty: float):
+    phase = np.arange(4000) / 1000.0 % 1.0
+    square = np.interp(phase, [0.0, 0.004, duty, duty + 0.004, 1.0], [-180.0, 180.0, 180.0, -180.0, -180.0])
+    if step:
+        noisy = square + 0.1 * np.random.default_rng(0).standard_normal(4000)
+        square = np.round((noisy + 0.4 * step) / step) * step
+    assert has_flat_levels(square)
+    assert not clipping_mask(square).any()
+    assert clipping_mask(np.minimum(square + 0.3 * np.random.default_rng(1).standard_normal(4000), 180.1)).any()
 
 
 def test_a_clipped_drive_is_refused():

@@ -89,6 +89,7 @@ def test_a_long_record_is_drawn_whole_and_its_beginning_sample_by_sample():
     tree = xr.DataTree.from_dict(
         {
             "posterior": xr.Dataset(drawn | skin),
+            "combined": xr.Dataset(drawn | skin),
             "prior": xr.Dataset(skin),
             "observed_data": xr.Dataset(seen, {"time": time}),
             "constant_data": xr.Dataset(

@@ -12,6 +12,7 @@ import fitact
 from fitact.files import to_json
 from fitact.fitting.geometry import UncertainGeometry
 from fitact.fitting.sensation import FeltDrive
+from fitact.result_text import describe_summary
 from fitact.summary import format_sd, summarize_log_normal
 
 
@@ -71,10 +72,13 @@ def test_a_table_of_thresholds_gives_the_sensation_of_each_draw(finger_posterior
     summary = felt.summary()
     level = summary["sensation"]["level"]
     assert level["unit"] == "dB"
-    assert level["q50"] == pytest.approx(20.0 * np.log10(summary["derived"]["times_threshold"]["q50"]), abs=1e-3)
+    combined = summary["derived"]["times_threshold"]["combined"]
+    assert level["q50"] == pytest.approx(20.0 * np.log10(combined["q50"]), abs=1e-3)
     assert summary["derived"]["times_threshold"]["u"] == summary["derived"]["force_mean"]["u"]
-    assert "these data do not test that law" in str(felt)
-    assert summary["sensation"]["sentence"] in str(felt)
+    assert "times_threshold" in str(felt)
+    text = describe_summary(summary, verbose=True)
+    assert "these data do not test that law" in text
+    assert summary["sensation"]["sentence"] in text
     assert "times_threshold" not in felt.force()
     assert "sensation" not in finger_posterior.summary()
 
@@ -137,6 +141,7 @@ def test_netcdf_has_arviz_groups_with_units(netcdf: Path, finger_posterior: fita
     with xr.open_datatree(netcdf, engine="h5netcdf") as tree:
         groups = {
             "posterior",
+            "combined",
             "sample_stats",
             "posterior_predictive",
             "observed_data",
