@@ -32,7 +32,7 @@ def estimate_table(content: dict[str, Any]) -> Rows:
     `content` is that of fit.json or summary.json. Cells: name, estimate with its combined standard uncertainty, 90 %
     interval, what most of the uncertainty comes from, and what the quantity rests on.
     """
-    rows: Rows = [("", "estimate ± u", "90 % interval", "uncertainty from")]
+    rows: Rows = [("", "estimate ± 1 sd", "90 % interval", "uncertainty from")]
     summaries = content["parameters"] | content["derived"]
     names = [name for name in content["parameters"] if name in PARAMETERS]
     remarks = {"force_mean": "computed, not measured", "times_threshold": "times the threshold of detection"}
@@ -90,7 +90,7 @@ def quantity_table(content: dict[str, Any]) -> Rows:
     for name, s in content.get("nuisances", {}).items():
         value = format_engineering(s["value"], s["unit"], 3)
         groups["measurement"].append((name, value, "", "", "", "", describe_quantity(name)))
-    rows: Rows = [("", "estimate ± u", "90 % interval", "u", "noise alone", "uncertainty from")]
+    rows: Rows = [("", "estimate ± 1 sd", "90 % interval", "u", "noise alone", "uncertainty from")]
     for heading, group_rows in groups.items():
         rows += [(heading,), *group_rows] if group_rows else []
     return rows
@@ -260,15 +260,12 @@ def _describe_default(source: str) -> tuple[str, str]:
     if source == "unstated stray C":
         return (
             "half the uncertainty of the stray capacitance",
-            "record once without the finger, or take I in the ground lead",
+            "record once without a finger, or I in the ground lead",
         )
-    symbol = source.rpartition(" ")[2]
-    needs = (
-        "measure the thickness of this skin, e.g. by optical coherence tomography"
-        if symbol == "Tsc"
-        else f"measure {symbol}"
-    )
-    return f"half the uncertainty of {symbol}", needs
+    name = source.removeprefix("default ").removeprefix("spread of ")
+    if name == "skin thickness":
+        return f"half the uncertainty of the {name}", "measure it, e.g. by optical coherence tomography"
+    return f"half the uncertainty of {name}", f"measure {name}"
 
 
 def next_step(content: dict[str, Any]) -> str:
@@ -281,7 +278,7 @@ def next_step(content: dict[str, Any]) -> str:
     if remedies := content["identifiability"]["remedies"]:
         now = max(abs(parameters[name]["sd"] / parameters[name]["q50"]) for name in names)
         then = max(remedies[0]["sd"][name] for name in names)
-        what = f"{_list(names)} to {format_percent(then)} (now {format_percent(now)}) before gain errors"
+        what = f"{', '.join(names)} to {format_percent(then)} (now {format_percent(now)}), gain errors apart"
         return f"Next: {remedies[0]['text']} would give {what}."
     if advice := content["identifiability"]["advice"]:
         return f"Next: {advice}"
@@ -289,7 +286,8 @@ def next_step(content: dict[str, Any]) -> str:
         sources = combine((parameters | content["derived"])[name]).get("sources", {})
         source = next(iter(sources), "")
         if is_default(source):
-            return f"Next: {_describe_default(source)[1]}; u of {name} is mostly {source}."
+            u = format_percent(combine((parameters | content["derived"])[name])["u"])
+            return f"Next: {_describe_default(source)[1]}, since {source} limits {name} to ± {u}."
     largest = max(content["budget"]["force_mean"]["components"], key=lambda each: each["u"], default=None)
     return (
         f"Next: the largest source of u of force_mean is {largest['source']}; {largest['reduce_by']}."
@@ -313,7 +311,8 @@ def verdict_sentence(content: dict[str, Any]) -> str:
         reason = f"{channels}{alone} cannot determine {id['blind_name'].partition(', which')[0]}"
     else:
         reason = f"this record does not constrain {id['blind_name'].partition(', which')[0]}"
-    prior = "the prior sets it" if id["verdict"] == "prior-limited" else "neither does a prior"
+    setting = "the prior of Ci sets it" if "Ci" in id["blind_direction"] else "the prior sets it"
+    prior = setting if id["verdict"] == "prior-limited" else "neither does a prior"
     return f"{id['verdict'].capitalize()}: {reason}; {prior}."
 
 

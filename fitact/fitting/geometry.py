@@ -18,7 +18,10 @@ from fitact.model.force import Geometry, force_constant
 from fitact.prior.distributions import Distribution, LogNormal
 from fitact.scene.scene import Scene
 
-_SYMBOLS = {"skin_thickness": "Tsc", "insulator_thickness": "Ti", "contact_area": "area", "friction_coefficient": "mu"}
+_NAMES = {  # in a few words
+    "skin_thickness": "skin thickness", "insulator_thickness": "insulator thickness", "contact_area": "contact area",
+    "friction_coefficient": "mu",
+}  # fmt: skip
 _FORCE = [i for i, name in enumerate(DERIVED_NAMES) if name.startswith("force")]
 _MEAN, _FRICTION = DERIVED_NAMES.index("force_mean"), DERIVED_NAMES.index("friction_mean")
 _SKIN_THICKNESS_SOURCE = (
@@ -262,7 +265,7 @@ class UncertainGeometry:
 
 def _contribution(name: str, origin: str, law: Distribution, sensitivity: Any, kind: str) -> Contribution:
     description = summary.describe_quantity(name)
-    words = f"{kind} {_SYMBOLS.get(name, description)}"
+    words = f"{kind} {_NAMES.get(name, description)}"
     size = float(law.log_sd), float(sensitivity)
     return Contribution(name, f"{description} ({origin})", words, *size, law, stated=kind == "stated")
 

@@ -208,7 +208,6 @@ def describe_assumed_Ci(scene: Scene | None, likelihood: Likelihood, prior_sets_
         return Remarks(notes=(f"{assumed}; the data determine Ci, so this assumption hardly matters",))
     return Remarks(
         warnings=(
-            f"{assumed}. Rsc, Csc, Ci and the force all depend on this assumption; state Ci and its uncertainty for"
-            " your panel and contact area under [prior]",
+            f"{assumed}; Rsc, Csc, Ci and the force depend on it: state Ci for your panel and contact under [prior]",
         )
     )

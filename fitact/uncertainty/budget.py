@@ -48,7 +48,7 @@ class Component:
     reduce_by: str = ""
     in_posterior: bool = True  # whether the posterior includes it
     is_shared: bool = False  # whether it is the same error in all records of a session
-    origin: str = ""  # what it comes from in a few words, such as "data" or "default Tsc"; "" means its source
+    origin: str = ""  # what it comes from in a few words, such as "data" or "default Ci"; "" means its source
 
     @property
     def u(self) -> float:

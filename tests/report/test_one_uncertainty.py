@@ -104,8 +104,10 @@ def test_the_next_measurement_is_a_table_of_expected_uncertainties(finger_poster
     assert titles == ("change", "u of force_mean", "of the circuit", "needs")
     expected = {row[0]: row[1] for row in changes}
     u, sources = (content["derived"]["force_mean"]["combined"][key] for key in ("u", "sources"))
-    halved = u * np.sqrt(1.0 - 0.75 * sources["spread of Tsc"])
-    assert float(expected["half the uncertainty of Tsc"].removesuffix(" %")) == pytest.approx(100.0 * halved, rel=0.05)
+    halved = u * np.sqrt(1.0 - 0.75 * sources["spread of skin thickness"])
+    assert float(expected["half the uncertainty of the skin thickness"].removesuffix(" %")) == pytest.approx(
+        100.0 * halved, rel=0.05
+    )
     assert all(float(x.removesuffix(" %")) <= float(now[1].removesuffix(" %")) for x in expected.values())
     assert all(needs for *_, needs in changes)
     assert content["identifiability"]["sentence"].count("%") <= 2  # the figures are in the table
@@ -114,6 +116,6 @@ def test_the_next_measurement_is_a_table_of_expected_uncertainties(finger_poster
 def test_a_default_decides_the_digits(finger_posterior: fitact.Posterior):
     force = finger_posterior.summary()["derived"]["force_mean"]
     shown = ESTIMATE.search(format_estimate(force))[0]
-    assert re.fullmatch(r"\d+0 ± \d0 \S+", shown)  # Tsc has one digit
+    assert re.fullmatch(r"\d+0 ± \d0 \S+", shown)  # the spread of the skin's thickness has one digit
     exact = {key: x for key, x in force.items() if key != "combined"}
     assert not format_estimate(exact).split(" ")[2].endswith("0")
