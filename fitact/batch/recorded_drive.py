@@ -134,8 +134,9 @@ class RecordedDriveProblem(BatchProblem):
     def fit(self, records: Sequence[Record], whiteness: bool = True) -> BatchFit:
         """Fit `unit` records, and optionally test the residuals for structure (`whiteness`), in double precision."""
         V, Vsc = stack_channel(records, "V"), stack_channel(records, "Vsc")
-        tables = Tables.from_records(self.shared, V, Vsc)
         driven, screened = Screening.from_values(V, self.settings), Screening.from_values(Vsc, self.settings)
+        white = np.where(driven.fine, driven.noise, 0.0)
+        tables = Tables.from_records(self.shared, V, Vsc, white)
         gain_sd = None
         if "gain" in self.names:
             edges = edge_gain_sd(float(self.shared.time_step), tables.b) if self.unresolved else np.zeros(len(V))
@@ -146,7 +147,7 @@ class RecordedDriveProblem(BatchProblem):
         weight = self.derive.weight[: self.evaluated.stop - self.evaluated.start]
         contact = weight, self.derive.coefficient, self.derive.normal_force
         square, tests, logs, gradients = _evaluate_records(
-            self.shared, self.phases, self.evaluated.start, contact, whiteness, tables.b, optimum, V, Vsc
+            self.shared, self.phases, self.evaluated.start, contact, whiteness, tables.b, optimum, V, Vsc, white
         )
         figures = self._figures(V, driven, screened, square, tests, inputs.linear_sd, optimum.gain)
         factor = np.linalg.inv(optima.r_factor)
@@ -300,12 +301,13 @@ def _evaluate_records(
     optima: ModelCoefficients,
     V: Float[Array, "records samples"],
     Vsc: Float[Array, "records samples"],
+    noise: Float[Array, " records"],
 ) -> tuple[Array, ResidualTestStatistics | None, Array, Array]:
     """Return the residual sums of squares, statistics of the residual tests, and the moments of `_derive_record`."""
 
-    def evaluate_record(record: tuple[Array, ModelCoefficients, Array, Array]) -> tuple[Array, Array, Array]:
-        center, optimum, v, vsc = record
-        own = shared.filter_drive(v, vsc, table_nodes(center))
+    def evaluate_record(record: tuple[Array, ModelCoefficients, Array, Array, Array]) -> tuple[Array, Array, Array]:
+        center, optimum, v, vsc, sd = record
+        own = shared.filter_drive(v, vsc, table_nodes(center), sd)
         shared_part, own_part = jnp.split(optimum.fitted, [shared.size])
         model = shared_part @ shared.fitted_functions + sum(c * row for c, row in zip(own_part, own, strict=False))
         # the voltage is not delayed, so that the steps of the drive have no part in it
@@ -313,7 +315,7 @@ def _evaluate_records(
         forces = _derive_record(own[:TABLE_NODES, times], shared.functions[:, times], contact, optimum)
         return shared.select_fitted(own[-1] - model), *forces
 
-    residuals, logs, gradients = map_blocks(evaluate_record, (tau, optima, V, Vsc), RECORD_BLOCK)
+    residuals, logs, gradients = map_blocks(evaluate_record, (tau, optima, V, Vsc, noise), RECORD_BLOCK)
     test = functools.partial(ResidualTestStatistics.from_residuals, phase_bins=phases)
     tests = map_blocks(test, residuals.astype(jnp.float32), SAMPLE_BLOCK) if whiteness else None
     return sum_rows(residuals * residuals), tests, logs, gradients

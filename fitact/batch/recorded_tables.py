@@ -13,12 +13,14 @@ from typing import NamedTuple, Self
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from fitact.batch.gauss_newton import decompose_qr, substitute_back
 from fitact.compiled import jit, map_blocks
 from fitact.likelihood.compression import BASELINE_NAMES, split_functions
 from fitact.likelihood.projection import MAX_DELAY, evaluate_baseline, root_products, uniform_recurrence
+from fitact.likelihood.smooth_drive import smooth_drive
 from fitact.model.response_table import (
     NODES,
     TABLE_HALF_WIDTH,
@@ -94,17 +96,22 @@ class SharedFunctions(NamedTuple):
         return chebyshev_polynomials((jnp.log(tau) - self.center) / TABLE_HALF_WIDTH, NODES)
 
     def filter_drive(
-        self, V: Float[Array, " samples"], Vsc: Float[Array, " samples"], tau: Float[Array, " nodes"]
+        self,
+        V: Float[Array, " samples"],
+        Vsc: Float[Array, " samples"],
+        tau: Float[Array, " nodes"],
+        noise: ArrayLike = 0.0,
     ) -> Float[Array, "own samples"]:
         """Return the functions of a record: the responses to V at the nodes, the steps of V, and last Vsc itself.
 
-        They are those at the times of the drive, i.e. without the delay `origin`.
+        They are those at the times of the drive, i.e. without the delay `origin`. The steps are those of V without its
+        white `noise` (sd in V).
         """
         x, samples = self.time_step / tau, V.size
-        rises = jnp.diff(jnp.pad(V, (AGES + 1, AGES), mode="edge"))
+        rises = jnp.diff(jnp.pad(smooth_drive(V, noise), (AGES + 1, AGES), mode="edge"))
         steps = [rises[AGES - age : AGES - age + samples] for age in range(-AGES, AGES)]
         # the first sample is a jump from 0
-        rise = jnp.pad(steps[AGES], (0, -samples % _BLOCK))
+        rise = jnp.pad(jnp.diff(V, prepend=V[:1]), (0, -samples % _BLOCK))
         u = uniform_recurrence(rise, V[0] * jnp.exp(x), x, _BLOCK)[:, :samples]
         return jnp.concatenate([u, jnp.stack([*steps, jnp.roll(Vsc, -self.origin)])])
 
@@ -136,10 +143,14 @@ class Tables(NamedTuple):
 
     @classmethod
     def from_records(
-        cls, shared: SharedFunctions, V: Float[np.ndarray, "records samples"], Vsc: Float[np.ndarray, "records samples"]
+        cls,
+        shared: SharedFunctions,
+        V: Float[np.ndarray, "records samples"],
+        Vsc: Float[np.ndarray, "records samples"],
+        noise: Float[np.ndarray, " records"],
     ) -> Self:
-        """Tabulate the responses of each record."""
-        g, b, is_possible, decay, across, products = _multiply_functions(shared, V, Vsc)
+        """Tabulate the responses of each record; `noise` is the sd of the white noise of V."""
+        g, b, is_possible, decay, across, products = _multiply_functions(shared, V, Vsc, noise)
         scale = np.sqrt(np.einsum("rii->ri", products))
         rest, *_ = root_products(products - np.swapaxes(across, 1, 2) @ across, scale)
         own = np.concatenate([across, rest], axis=1)
@@ -183,18 +194,22 @@ def make_response_table(
 
 @functools.partial(jit, fast=True)
 def _multiply_functions(
-    shared: SharedFunctions, V: Float[Array, "records samples"], Vsc: Float[Array, "records samples"]
+    shared: SharedFunctions,
+    V: Float[Array, "records samples"],
+    Vsc: Float[Array, "records samples"],
+    noise: Float[Array, " records"],
 ) -> tuple[Array, ...]:
     """Return estimates and decays as in `Tables`, and the inner products of functions with the shared ones and own."""
 
-    def multiply_record(record: tuple[Array, Array]) -> tuple[Array, ...]:
-        g, b, is_possible = _estimate_start(shared, *record)
+    def multiply_record(record: tuple[Array, Array, Array]) -> tuple[Array, ...]:
+        v, vsc, sd = record
+        g, b, is_possible = _estimate_start(shared, v, vsc)
         nodes = table_nodes(b)
         decay = shared.decay @ shared.decay_polynomials(nodes)
-        used = shared.is_fitted * shared.filter_drive(*record, nodes)
+        used = shared.is_fitted * shared.filter_drive(v, vsc, nodes, sd)
         return g, b, is_possible, decay, shared.fitted_functions @ used.T, used @ used.T
 
-    return map_blocks(multiply_record, (V, Vsc), RECORD_BLOCK)
+    return map_blocks(multiply_record, (V, Vsc, noise), RECORD_BLOCK)
 
 
 def _estimate_start(

@@ -86,7 +86,9 @@ def _channel_samples(
         rows |= {"time": zeros, "voltage": zeros, "frequency": None, "omega": 2.0 * math.pi * record.frequency}
     else:
         frequency = record.frequency() if choice.periodic else None
-        rows |= {"time": record.time, "voltage": choice.voltage, "frequency": frequency}
+        # noise of V hides a delay
+        voltage = choice.voltage if channel.smooth is None else np.asarray(channel.smooth)[: len(record)]
+        rows |= {"time": record.time, "voltage": voltage, "frequency": frequency}
     return ChannelSamples(
         **rows,
         channel=fitted.channel,

@@ -55,6 +55,8 @@ def free_timing(
     good = grid[squares < squares.min() + margin]
     change = {"delay": 0.0, "clock": 0.0} | dict(zip(names, good.mean(axis=0) * units, strict=True))
     channel = dataclasses.replace(channel, shift=channel.shift + change["delay"], clock=channel.clock + change["clock"])
+    if (steps := round(float(channel.shift) / float(channel.time_step))) and channel.smooth is not None:
+        channel = recompress(channel.delay_noise(steps, float(np.max(circuit.tau))), circuit)
     if not edges.any():
         return channel
     timing_sd = np.hypot(good.std(axis=0), step / np.sqrt(12.0))

@@ -70,6 +70,9 @@ def compress_channel(
         fields = {field.name: getattr(compression, field.name) for field in dataclasses.fields(compression)}
         compression = GridCompression(**fields)
     else:
+        if channel.smooth is not None:
+            smooth = np.asarray(channel.smooth)[samples]
+            how |= {"smooth": smooth, "slope": np.gradient(smooth, arrays[1])}
         compression = compress(*arrays, expected_terms=terms, delayed=_shifts_response(channel), **how)
     return dataclasses.replace(channel, compression=compression), ""
 

@@ -9,6 +9,7 @@ to the coordinates of a `fitact.likelihood.compression.Compression` and to the s
 """
 
 import dataclasses
+import math
 from typing import Any
 
 import equinox as eqx
@@ -33,7 +34,7 @@ from fitact.likelihood.noise import (
 from fitact.likelihood.projection import MAX_DELAY, baseline_functions
 from fitact.model.circuit import Channel, Circuit, HighpassTerms
 from fitact.model.drive import Drive, Sampled
-from fitact.model.response import response_and_rate
+from fitact.model.response import highpass, response_and_rate
 from fitact.model.skin import WithSkin
 
 CHARGES = ("charge", "charge_2", "charge_3", "charge_4")  # one for each time constant, the slowest first
@@ -98,6 +99,7 @@ class ChannelLikelihood(eqx.Module):
     stray: ArrayLike | None = None
     # rows of a current whose drive was recorded, with its noise; `drive` is then an estimate of the drive
     charges: ChargeRows | None = None
+    smooth: Float[Array, " samples"] | None = None  # recorded drive as a delay shifts it (`smooth_drive`), V
 
     @property
     def linear_names(self) -> tuple[str, ...]:
@@ -180,6 +182,19 @@ class ChannelLikelihood(eqx.Module):
         index = np.arange(self.time.size)
         return self.exclude_samples((index < MAX_DELAY) | (index >= self.n_samples - MAX_DELAY))
 
+    def delay_noise(self, steps: int, tau: float) -> "ChannelLikelihood":
+        """Return the channel with the noise of its recorded drive `steps` samples later, as its signal is.
+
+        The table of responses lets what was recorded grow by exp(delay / tau); this is taken back. A compression must
+        be made anew.
+        """
+        if self.smooth is None or steps == 0:
+            return self
+        assert isinstance(self.drive, Sampled)
+        smooth, growth = np.asarray(self.smooth), math.exp(-steps * float(self.time_step) / tau)
+        noise = growth * np.roll(np.asarray(self.drive.samples) - smooth, steps)
+        return dataclasses.replace(self, drive=dataclasses.replace(self.drive, samples=smooth + noise))
+
     def without_samples(self) -> "ChannelLikelihood":
         """Return the channel with only two samples if it has a compression.
 
@@ -194,9 +209,11 @@ class ChannelLikelihood(eqx.Module):
         if isinstance(drive, Sampled):
             drive = Sampled(np.asarray(drive.time)[:2], np.asarray(drive.samples)[:2], drive.period)
         ends, extremes = time[[0, -1]], np.array([observed.min(), observed.max()])
-        rate = None if self.rate is None else np.zeros(2)
+        rate, smooth = (None if x is None else np.zeros(2) for x in (self.rate, self.smooth))
         effects = None if self.effects is None else np.zeros((len(self.effects), 2))
-        shortened = dataclasses.replace(self, time=ends, observed=extremes, drive=drive, rate=rate, effects=effects)
+        shortened = dataclasses.replace(
+            self, time=ends, observed=extremes, drive=drive, rate=rate, effects=effects, smooth=smooth
+        )
         charges = None if self.charges is None else jax.tree.map(lambda _: np.zeros(2), self.charges)
         return dataclasses.replace(shortened, weight=None, whitening=None, charges=charges, phases=None)
 
@@ -246,6 +263,8 @@ class ChannelLikelihood(eqx.Module):
             time = self.drive.time  # identical to the samples of V, so that `highpass` needs no search
         else:
             time = self.drive_time(inputs.delay + extra_delay, inputs.clock)
+        if self.smooth is not None and not undelayed:
+            return inputs.gain * self._delay_smooth_drive(inputs, time)
         total, rate = self._response_and_rate(inputs, time)
         if rate is not None and self.charges is not None:
             total = jnp.interp(
@@ -254,6 +273,21 @@ class ChannelLikelihood(eqx.Module):
         elif rate is not None and self.rate is not None:
             total = total + rate * self.rate
         return inputs.gain * total
+
+    def _delay_smooth_drive(self, inputs: ChannelInputs, time: Array) -> Float[Array, " samples"]:
+        """Return the response at the drive's `time` to the smooth drive, and undelayed to the rest of the drive.
+
+        The response to the rest decays, or grows, until that time, as in the table of responses.
+        """
+        assert isinstance(self.drive, Sampled)
+        smooth = dataclasses.replace(self.drive, samples=self.smooth)
+        rest = dataclasses.replace(self.drive, samples=self.drive.samples - self.smooth)
+        how: dict[str, Any] = {"steady_state": self.steady_state, "channel": self.channel}
+        (total, _), terms = response_and_rate(inputs.circuit, smooth, time, **how), self.terms(inputs)
+        for weight, tau in zip(terms.weight, terms.tau, strict=True):
+            growth = jnp.exp((self.time - time) / tau)
+            total = total + weight * growth * highpass(rest, self.time, tau, steady_state=self.steady_state)
+        return total if terms.direct is None else total + terms.direct * rest.value(self.time)
 
     def _response_and_rate(self, inputs: ChannelInputs, time: Array) -> tuple[Array, ArrayLike | None]:
         """Return the response without what follows dV/dt, and the capacitance that does (F), or None."""

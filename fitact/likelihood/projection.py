@@ -68,6 +68,7 @@ def compress(
     slope: Float[np.ndarray, " samples"] | None = None,
     student: Float[np.ndarray, "3 samples"] | None = None,
     effects: Float[np.ndarray, "effects samples"] | None = None,
+    smooth: Float[np.ndarray, " samples"] | None = None,
 ) -> Compression:
     """Project a record on responses to `drive`, for time constants within a factor 9 of the one in `expected_terms`.
 
@@ -82,7 +83,8 @@ def compress(
     the first and after the last sample. `slope` replaces dV/dt in the field of that name. `student`
     holds weights of the squares, and two functions to be projected instead of the record; `observed` and its slope are
     then without the model at which they were computed. `charges` are rows that take the place of `observed`, `rate` and
-    `slope`, and of the filter. `effects` are further functions of the model.
+    `slope`, and of the filter. `effects` are further functions of the model. `smooth` is a measured V as a delay shifts
+    it (`smooth_drive`), V.
 
     Terms of a grid of time constants have arrays of weights and time constants; the table then holds the responses of
     the grid instead of series.
@@ -121,7 +123,8 @@ def compress(
     )
     filtering = WhiteningState.start(taps, sum(sizes.values()), charges)
     if isinstance(drive, Sampled) and measured:
-        parts = _accumulate_measured(table, drive, samples, filtering, MAX_DELAY if delayed else 0)
+        shifted = np.asarray(drive.samples)[: time.size] if smooth is None else smooth
+        parts = _accumulate_measured(table, drive, samples, filtering, MAX_DELAY if delayed else 0, shifted)
     else:
         is_simple = steady_state and taps is None and student is None
         period = samples_per_period(drive, time) if is_simple else None
@@ -421,9 +424,17 @@ def is_exactly_uniform(time: np.ndarray, tolerance: float = 1e-9) -> bool:
 
 
 def _accumulate_measured(
-    table: TableNodes, drive: Sampled, samples: Samples, filtering: WhiteningState | None, ages: int
+    table: TableNodes,
+    drive: Sampled,
+    samples: Samples,
+    filtering: WhiteningState | None,
+    ages: int,
+    shifted: Float[np.ndarray, " samples"],
 ) -> Iterator[np.ndarray]:
-    """Yield the inner products of each chunk for a measured drive; `ages` steps before and after a sample."""
+    """Yield the inner products of each chunk for a measured drive.
+
+    `ages` steps of V before and after a sample are functions, those of V as a delay shifts it.
+    """
     time, voltage = samples.time, np.asarray(drive.samples)[: samples.time.size]
     length, step, first = chunk_length(time.size), float(table.step), float(voltage[0])
     x = step / table.nodes if is_exactly_uniform(time) and step < 300.0 * np.min(table.nodes) else None  # no overflow
@@ -433,7 +444,7 @@ def _accumulate_measured(
     voltages = chunks(samples._replace(observed=voltage, effects=None, charges=None), length)
     advance = jit(_advance_chunk, fast=time.size > MANY_SAMPLES)
     for number, (chunk, driven) in enumerate(zip(chunks(samples, length), voltages, strict=True)):
-        steps = drive_steps(voltage, number * length, length, ages) / step
+        steps = drive_steps(shifted, number * length, length, ages) / step
         total, last, filtering = advance(table, chunk, driven.observed, steps, last, time[0], x, filtering)
         yield total
 

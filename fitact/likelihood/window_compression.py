@@ -12,6 +12,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from jaxtyping import Float
 
+from fitact.data.record import white_noise_sd
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.charge_rows import LAG, ChargeRows, filter_highpass, step_means, whiten_rows
 from fitact.likelihood.compression import (
@@ -32,6 +33,7 @@ from fitact.likelihood.projection import (
     evaluate_baseline,
     factor_products,
 )
+from fitact.likelihood.smooth_drive import smooth_drive
 from fitact.model.response_table import count_nodes
 
 REACH = 4.0  # factor by which b may change
@@ -144,7 +146,8 @@ class WindowCompressor:
             used = weight if whitening is None else whitening.mask
             count = late.size if used is None else int(np.count_nonzero(used))
             if channel.timing:
-                steps = drive_steps(functions[-2], 0, late.size, MAX_DELAY) / step
+                smooth = smooth_drive(functions[-2], white_noise_sd(functions[-2]))
+                steps = drive_steps(smooth, 0, late.size, MAX_DELAY) / step
         rest = observed - functions[-1] - (0.0 if table.expected_rate is None else table.expected_rate * rate)
         own = {"signal": functions[:rank], "decay": shared[:charged], "steps": steps}
         own |= zip(_baseline_names(channel), shared[charged:, None], strict=True)

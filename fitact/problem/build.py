@@ -23,9 +23,10 @@ from fitact.likelihood.channel import CHARGES, FIRST_CHARGE, LINEAR_NUISANCES, C
 from fitact.likelihood.compression import HUM_FREQUENCIES
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import Autoregression, estimate_quiet_noise, require_uniform
+from fitact.likelihood.smooth_drive import smooth_drive
 from fitact.model.circuit import Channel, Circuit, FinalCircuit, passes_direct_current
 from fitact.model.drive import Sampled
-from fitact.model.skin import circuit_parameters, constant_skin_circuit, limits_current
+from fitact.model.skin import WithSkin, circuit_parameters, constant_skin_circuit, limits_current
 from fitact.prior.distributions import Distribution, LogNormal
 from fitact.prior.prior import Prior
 from fitact.prior.product import multiply
@@ -270,6 +271,7 @@ def _build_channel(
         timing=timing,
         noise=scene.measurement.noise_model,
         columns=tuple(range(len(LINEAR_NUISANCES))),
+        smooth=_smooth_drive(record) if channel == "Vsc" and _can_smooth(choice, template) else None,
     )
     if channel == "Ft":
         likelihood = make_friction_channel(likelihood, record, scene, choice, float(taus[0]))
@@ -368,6 +370,19 @@ def _make_charge_rows(
     )
     usable = not limits_current(bare.template) and not passes_direct_current(bare.template)
     return set_rows(channel, rows, V, 0.0), estimate if usable else None, current.noise_I, hum
+
+
+def _can_smooth(choice: DriveModel, template: Circuit) -> bool:
+    """Return whether a delay may shift a recorded drive without its noise."""
+    return choice.name == "measured" and not choice.steady_state and not isinstance(template, WithSkin)
+
+
+def _smooth_drive(record: Record) -> Float[np.ndarray, " samples"] | None:
+    """Return V as a delay shifts it; None if it has no noise, or is rounded to steps above its noise."""
+    noise = white_noise_sd(record["V"])
+    if noise == 0.0 or rounding_noise_sd(record["V"]) > 0.0:
+        return None
+    return pad_samples(smooth_drive(record["V"], noise))
 
 
 def _require_whole_drive(record: Record, choice: DriveModel) -> None:

@@ -62,7 +62,8 @@ def assert_equal_to_separate_fit(row: dict, made: fitact.Record, sd_error: float
         assert row[name] == pytest.approx(np.exp(log), rel=1e-6)
         assert row[f"{name}_log_sd"] == pytest.approx(log_sd, rel=sd_error)
     assert row["force_from_prior"] == pytest.approx(alone.identifiability.force_from_prior, rel=1e-4)
-    assert row["chi2_reduced"] == pytest.approx(alone.figures["chi2_reduced"], rel=1e-6)
+    # a fit scales the noise of V that it delays by whole steps for the time constant from which it started
+    assert row["chi2_reduced"] == pytest.approx(alone.figures["chi2_reduced"], rel=1e-5)
 
 
 @pytest.fixture(scope="module")
@@ -131,8 +132,11 @@ def test_records_of_different_skew_are_fitted_together_within_a_step():
     records = [record(number, delay=2.3 + 0.04 * (number - 8)) for number in range(17)]
     assert accepted(records).all()
     rows = fitact.fit_many(records, SCENE, progress=False)
-    for number in (0, 16):
-        assert_equal_to_separate_fit(rows[number], records[number])
+    for number in (
+        0,
+        16,
+    ):  # whose skew rounds to another whole step, so that a fit takes noise of V from another sample
+        assert_equal_to_separate_fit(rows[number], records[number], sd_error=3e-3)
 
 
 def test_edges_between_two_samples_free_a_gain():
