@@ -24,6 +24,7 @@ class Series(NamedTuple):
     interval: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # times, and ends of the predictive interval
     clipped: np.ndarray | None = None  # which samples the converter clipped
     has_residuals: bool = True  # whether residuals of the fit are drawn below
+    white: np.ndarray | None = None  # residuals that take the place of data minus fit; NaN where none counts
 
 
 def time_chart(time: np.ndarray, series: Sequence[Series], columns: int = 2000) -> Chart:
@@ -32,7 +33,12 @@ def time_chart(time: np.ndarray, series: Sequence[Series], columns: int = 2000) 
     if time.size <= count:
         return interactive.chart(time_plot(time, series, columns))
     begin = [
-        each._replace(values=each.values[:count], fit=None if each.fit is None else each.fit[:count], interval=None)
+        each._replace(
+            values=each.values[:count],
+            fit=None if each.fit is None else each.fit[:count],
+            white=None if each.white is None else each.white[:count],
+            interval=None,
+        )
         for each in series
     ]
     return interactive.chart(
@@ -79,8 +85,12 @@ def time_plot(
         fitted = each.fit[kept]
         traces.append(draw_extremes(y, kept, fitted, "fit" if each.has_residuals else "stated drive", MODEL))
         if each.has_residuals:
-            rest = Axis.from_values("data − fit", each.unit, values - fitted)
-            below = draw_extremes(rest, kept, values - fitted, "data − fit", ALERT) | {"showlegend": False}
+            name, shown, rests = "data − fit", kept, values - fitted
+            if each.white is not None:
+                name, shown = "residuals", np.isfinite(each.white)
+                rests = each.white[shown]
+            rest = Axis.from_values(name, each.unit, rests)
+            below = draw_extremes(rest, shown, rests, name, ALERT) | {"showlegend": False}
             rows.append((rest, [below]))
             heights.append(1.0)
     size = int(row_pixels * sum(heights)) + 80  # legend and labels

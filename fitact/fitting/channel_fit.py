@@ -13,6 +13,7 @@ from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
 from fitact.fitting.residual_statistics import channel_statistics, outliers
 from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
+from fitact.likelihood.charge_rows import LAG, estimate_current_noise
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import STUDENT_DOF, student_weight
 from fitact.likelihood.spectrum_channel import join_complex
@@ -37,11 +38,15 @@ class ChannelFit:
     # standard deviation of the noise, estimated from the residuals, V or A; for a spectrum relative to the magnitude
     sigma: float
     linear: dict[str, float]  # free offset, drift, hum and charge at the optimum, V or A
-    residuals: Samples  # data minus fit, V or A; of a spectrum real and imaginary parts in turn
+    # data minus fit, V or A; of a spectrum real and imaginary parts in turn; of I with a recorded V the part of it that
+    # is noise of I, and not of V
+    residuals: Samples
     weight: Samples | None  # relative inverse noise sd; 0 excludes a sample, None means 1
     log_likelihood: float  # log-likelihood of the samples, including all constants
     figures: dict[str, float]  # figures of merit: chi2_reduced, rms_residual, noise_expected, runs_z, ...
     full_because: str  # reason why the likelihood is not compressed, as a clause; "" if it is
+    # whitened residuals of I with a recorded V over the time steps, A; NaN where they do not count
+    white: Samples | None = None
 
     @property
     def relative_noise_sd(self) -> Samples:
@@ -75,6 +80,12 @@ class ChannelFit:
         inputs = likelihood.make_inputs(optimum.circuit, theta, channel)
         # the noise is passed as an array, because jit would compile again for every new number
         residuals, white, beta = sample_residuals(channel, inputs, np.asarray(sigma))
+        of_steps = None
+        if channel.charges is not None:  # whose signal has the derivative of the noise of V
+            steps = float(channel.shift) / float(channel.time_step)
+            residuals = estimate_current_noise(channel.charges, np.asarray(white), steps)
+            of_steps = np.where(np.asarray(channel.charges.used) > 0.0, white, np.nan)[: channel.n_samples]
+            of_steps = np.append(of_steps[LAG:], np.full(LAG, np.nan))
         unpadded = slice(channel.n_samples)
         residuals, weight = residuals[unpadded], None if channel.equally_weighted else channel.weights[unpadded]
         names = [channel.qualified_name(channel.linear_names[column]) for column in channel.columns]
@@ -112,6 +123,7 @@ class ChannelFit:
             log_likelihood=_log_likelihood(channel, residuals, white, sigma),
             figures=figures,
             full_because=reason,
+            white=of_steps,
         )
 
 

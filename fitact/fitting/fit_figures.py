@@ -23,8 +23,9 @@ def plot_fit(record: Record | Spectrum, channels: Sequence[ChannelFit]) -> Any:
     for name, title in CHANNEL_TITLES.items():
         if name in record:
             stated = voltage if name == "V" and not np.array_equal(voltage, record["V"]) else None
-            fitted = traces[name].prediction if name in traces else stated
-            series.append(charts.Series(title, CHANNEL_UNITS[name], record[name], fitted, has_residuals=name in traces))
+            fitted, white = (traces[name].prediction, traces[name].white) if name in traces else (stated, None)
+            each = charts.Series(title, CHANNEL_UNITS[name], record[name], fitted, has_residuals=name in traces)
+            series.append(each._replace(white=white))
         elif name == "V":
             series.append(charts.Series(f"{title}, stated", "V", voltage))
     return charts.show_plots(charts.time_plot(record.time, series))

@@ -35,6 +35,14 @@ def step_means(values: Float[np.ndarray, "*n samples"], delay: float = 0.0) -> F
 
     The step is taken `delay` time steps later, at most `MAX_STEPS` in either direction.
     """
+    taps, shift = _mean_filter(delay)
+    result = np.zeros_like(values)
+    result[..., shift:] = scipy.signal.lfilter(taps, [1.0], values[..., : values.shape[-1] - shift])
+    return result
+
+
+def _mean_filter(delay: float) -> tuple[Float[np.ndarray, " taps"], int]:
+    """Return the filter of `step_means`, and by how many samples its result is later."""
     whole = int(np.floor(delay))
     part = delay - whole
     others = _INTERPOLATED[:, None] != _INTERPOLATED
@@ -43,11 +51,21 @@ def step_means(values: Float[np.ndarray, "*n samples"], delay: float = 0.0) -> F
     )
     taps = np.convolve(np.prod(factors, axis=1), _MEAN_OF_STEP)
     used = np.flatnonzero(taps)[[0, -1]]
-    shift = LAG + 2 + _BEFORE - whole - int(used[1])  # the row k + LAG takes the samples from k + whole - 4 on
-    result = np.zeros_like(values)
-    last = taps[used[1] : used[0] - 1 if used[0] else None : -1]
-    result[..., shift:] = scipy.signal.lfilter(last, [1.0], values[..., : values.shape[-1] - shift])
-    return result
+    return taps[used[1] : used[0] - 1 if used[0] else None : -1], LAG + 2 + _BEFORE - whole - int(used[1])
+
+
+def estimate_current_noise(rows: "ChargeRows", white: Float[np.ndarray, " samples"], delay: float) -> np.ndarray:
+    """Return the noise of each sample of I that is most probable for whitened residuals of the rows, A.
+
+    The rest of the residuals is noise of V. For normal noise it is the covariance of the sample with the rows, times
+    the inverse of their covariance, times the residuals. `delay` as in `step_means`.
+    """
+    gain, decay, used = (np.asarray(each) for each in (rows.gain, rows.decay, rows.used))
+    bands = np.stack([np.ones_like(decay), -np.append(decay[1:], 0.0)])
+    summed, _ = scipy.linalg.lapack.dtbtrs(bands, (used * white)[:, None], uplo="L", trans="T", diag="U")
+    (taps, shift), noise = _mean_filter(delay), np.zeros(white.size)
+    noise[: white.size - shift] = scipy.signal.lfilter(taps, [1.0], (gain * summed[:, 0])[shift:][::-1])[::-1]
+    return noise
 
 
 class ChargeRows(eqx.Module):

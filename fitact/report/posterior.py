@@ -52,7 +52,8 @@ def _record_chart(tree: Any, axis: str, columns: int) -> Chart:
             shown = np.isfinite(ends[0])
             interval = predicted[axis].values[shown], ends[0][shown], ends[1][shown]
             values, unit = observed[name].values, observed[name].attrs["units"]
-            series.append(Series(title, unit, values, constant[f"{name}_fit"].values, interval))
+            white = constant[f"{name}_white"].values if f"{name}_white" in constant else None
+            series.append(Series(title, unit, values, constant[f"{name}_fit"].values, interval, white=white))
         elif recorded in constant:
             fit = drive if channel == "V" else None
             values, unit = constant[recorded].values, constant[recorded].attrs["units"]

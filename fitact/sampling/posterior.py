@@ -376,6 +376,8 @@ class Posterior(Display):
             axes[time] = (time, channel.record.time, {"units": "s"})
             observed[name] = (time, channel.record[channel.channel], unit)
             constant[f"{name}_fit"] = (time, channel.prediction, unit)
+            if channel.white is not None:
+                constant[f"{name}_white"] = (time, channel.white, unit)
             constant[_variable_name(channel, "V")] = (time, channel.choice.voltage, {"units": "V"})
             constant |= self._unfitted_channels(channel, channel.record, time)
         attributes = {
@@ -432,6 +434,8 @@ class Posterior(Display):
             sd = channel.relative_noise_sd[::stride]
             chosen = self.points[:, draws], self._deviates[:, draws]
             mean = derived.evaluate_draws(_predict_signal, predicting, model.time.size, *chosen)[..., : sd.size]
+            if model.charges is not None:  # whose signal has the derivative of the noise of V
+                mean = mean - np.median(mean, axis=(0, 1)) + channel.prediction[::stride]
             sigma = np.exp(self.points[:, draws, self.fit.theta.size + i, None])
             noise = draw_noise(rng, model.noise, model.whitening, mean.shape, stride)
             noisy = mean + sigma * sd * noise

@@ -79,13 +79,16 @@ class Budget:
         return Budget((*self.components, *self.unstated))
 
     def origins(self) -> dict[str, float]:
-        """Return the fractions of the variance by what they come from, largest first."""
+        """Return the fractions of the variance by what they come from, to four digits, largest first."""
         parts: dict[str, float] = {}
         for each in self.components:
             name = each.origin or each.source
             parts[name] = parts.get(name, 0.0) + each.u**2
         total = sum(parts.values())
-        return {name: x / total for name, x in sorted(parts.items(), key=lambda item: -item[1]) if x > 0.0}
+        ranked = sorted(
+            ((name, round(x / total, 4)) for name, x in parts.items() if x > 0.0), key=lambda item: -item[1]
+        )
+        return {name: fraction for name, fraction in ranked if fraction > 0.0}
 
     def scale_posterior(self, log_sd: float) -> "Budget":
         """Return the budget with the posterior's components scaled to the standard deviation `log_sd` of its draws."""

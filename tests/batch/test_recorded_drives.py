@@ -48,22 +48,24 @@ def accepted(records: list[fitact.Record]) -> np.ndarray:
         return group.batch_problem.fit(padded).accepted[: len(records)]
 
 
-def assert_equal_to_separate_fit(row: dict, made: fitact.Record, sd_error: float = 1e-3) -> None:
+def assert_equal_to_separate_fit(
+    row: dict, made: fitact.Record, sd_error: float = 1e-3, error: float = 1e-6, figure_error: float = 1e-5
+) -> None:
     alone = fitact.fit(made, SCENE)
     assert (row["result"], row["trusted"], row["samples"]) == (alone.result, alone.trusted, alone.figures["samples"])
     assert row["verdict"] == alone.identifiability.verdict
     assert row["freed"] == ", ".join(alone.model()["freed"])
     for i, name in enumerate(NAMES):
-        assert row[name] == pytest.approx(np.exp(alone.theta[i]), rel=1e-6)
+        assert row[name] == pytest.approx(np.exp(alone.theta[i]), rel=error)
         assert row[f"{name}_log_sd"] == pytest.approx(alone.sd[i], rel=1e-4)
     logs, log_sds = alone.laplace.log_derived[0], alone.laplace.derived_log_sd
     names = ("g", "b", "force_mean", "force_peak", "force_rms", "friction_mean")
     for name, log, log_sd in zip(names, logs, log_sds, strict=True):
-        assert row[name] == pytest.approx(np.exp(log), rel=1e-6)
+        assert row[name] == pytest.approx(np.exp(log), rel=error)
         assert row[f"{name}_log_sd"] == pytest.approx(log_sd, rel=sd_error)
     assert row["force_from_prior"] == pytest.approx(alone.identifiability.force_from_prior, rel=1e-4)
     # a fit scales the noise of V that it delays by whole steps for the time constant from which it started
-    assert row["chi2_reduced"] == pytest.approx(alone.figures["chi2_reduced"], rel=1e-5)
+    assert row["chi2_reduced"] == pytest.approx(alone.figures["chi2_reduced"], rel=figure_error)
 
 
 @pytest.fixture(scope="module")
@@ -132,11 +134,10 @@ def test_records_of_different_skew_are_fitted_together_within_a_step():
     records = [record(number, delay=2.3 + 0.04 * (number - 8)) for number in range(17)]
     assert accepted(records).all()
     rows = fitact.fit_many(records, SCENE, progress=False)
-    for number in (
-        0,
-        16,
-    ):  # whose skew rounds to another whole step, so that a fit takes noise of V from another sample
-        assert_equal_to_separate_fit(rows[number], records[number], sd_error=3e-3)
+    assert_equal_to_separate_fit(rows[0], records[0])
+    # the skew of the last rounds to another whole step, so that its fit takes the noise of V from another sample, which
+    # moves estimates by some hundredths of a standard error
+    assert_equal_to_separate_fit(rows[16], records[16], sd_error=3e-3, error=2e-5, figure_error=3e-3)
 
 
 def test_edges_between_two_samples_free_a_gain():

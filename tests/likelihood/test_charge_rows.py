@@ -5,7 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fitact.likelihood.charge_rows import LAG, ChargeRows, RowCovariance, step_means, whiten_rows
+from fitact.likelihood.charge_rows import (
+    LAG,
+    ChargeRows,
+    RowCovariance,
+    estimate_current_noise,
+    step_means,
+    whiten_rows,
+)
 
 STEP = 1e-5
 
@@ -54,6 +61,23 @@ def test_whitening_is_that_of_the_dense_covariance():
         compiled = ChargeRows(*np.zeros((3, 40)), gain, decay, covariance.used * 1.0).whiten(jnp.asarray(rows))
     np.testing.assert_allclose(compiled[:, used], 2.0 * expected, rtol=1e-12)
     np.testing.assert_allclose(covariance.solve(rows[0])[used], np.linalg.solve(dense, rows[0, used]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.37])
+def test_the_noise_of_I_is_that_of_the_dense_conditional_mean(delay: float):
+    """E[e | r] = Cov(e, r) Cov(r)^-1 r, where e is white and rows are means of e and something else."""
+    rng, size, sd = np.random.default_rng(3), 60, 2.0
+    variance, neighbours = rng.uniform(30.0, 50.0, size), rng.uniform(-15.0, 5.0, size)
+    excluded = np.isin(np.arange(size), [*range(2 * LAG), 30])
+    covariance = RowCovariance(variance, neighbours, excluded)
+    gain, decay = covariance.recursion(sd)
+    rows, used = ChargeRows(*np.zeros((3, size)), gain, decay, covariance.used * 1.0), np.flatnonzero(~excluded)
+    residuals = rng.standard_normal(size)
+    means = step_means(np.eye(size), delay).T  # rows by samples
+    dense = np.diag(variance) + np.diag(neighbours[1:], 1) + np.diag(neighbours[1:], -1)
+    expected = sd**2 * means[used].T @ np.linalg.solve(dense[np.ix_(used, used)], residuals[used])
+    found = estimate_current_noise(rows, whiten_rows(gain, decay, residuals), delay)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
 def test_rows_of_a_run_count_as_their_mean():
