@@ -117,7 +117,7 @@ def inspect(
     Raises:
         InputError: the file cannot be read, or its V, Vsc or I could not be fitted.
     """
-    capture = replace_rounded_times(merge_other_files(read_capture(path), path, channels or {}), rate)
+    capture = replace_rounded_times(merge_other_files(read_capture(path, rate=rate), path, channels or {}, rate), rate)
     if channels or scale or has_standard_names(capture):
         record = to_record(capture, channels or {}, scale or {})
         arrays = {name: (record[name], CHANNEL_UNITS[name]) for name in record.channels}

@@ -3,6 +3,8 @@
 import collections
 import dataclasses
 import functools
+import itertools
+import math
 import re
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,6 +13,7 @@ from fitact.data.readers import layouts
 from fitact.errors import InputError
 
 _EXAMPLE = "time_s,V_V,Vsc_V,I_A"
+MINUS = "\N{MINUS SIGN}"  # as typeset, in place of the hyphen
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 _QUANTITY = re.compile(r"(?:analog:)?\s*([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*([a-zµμ]*)", re.IGNORECASE)
 
@@ -31,8 +34,14 @@ class Column(NamedTuple):
     attenuation: float | None = None
 
 
-def read_header(text: str, source: str, sidecar_text: str = "") -> "Header":
-    """Return the header of a file that begins with `text`; `sidecar_text` holds `key:value` lines of another file."""
+def read_header(
+    text: str, source: str, sidecar_text: str = "", rate: float | None = None, *, is_clock: bool = False
+) -> "Header":
+    """Return the header of a file that begins with `text`; `sidecar_text` holds `key:value` lines of another file.
+
+    `rate` (Hz) gives the times of a file that states neither times nor a time step. `is_clock`: whether times of day
+    were replaced by seconds since midnight.
+    """
     head = text[:4096]  # enough for most headers; splitting lines into cells dominates the time
     header = Header.from_text(head.rpartition("\n")[0], sidecar_text, source)
     if not header.is_plain:
@@ -42,16 +51,19 @@ def read_header(text: str, source: str, sidecar_text: str = "") -> "Header":
             f"{source}: there are no rows of numbers; expected a header such as {_EXAMPLE}, and rows of numbers"
         )
     maker = next((maker for maker, mark in layouts.MAKERS if mark.search(head)), "text")
-    header = dataclasses.replace(header, numeric=header.numeric | header.standard_columns(), maker=maker)
+    numeric, is_clock = header.numeric | header.standard_columns(), is_clock and header.clock is not None
+    header = dataclasses.replace(header, numeric=numeric, maker=maker, rate=rate, is_clock=is_clock)
     segments = header.find_values(layouts.SEGMENT_KEYS)[:1]
     if segments and (parse_number(segments[0], header.decimal_comma) or 1.0) > 1.0:
         raise InputError(f"{source}: holds {segments[0]} segments; export one of them")
     if header.time is None and header.time_grid[1] is None:
-        names = ", ".join(header.names.cells) if header.names else "no header"
+        count = len(header.numeric)
+        found = f"{count} column{'s' * (count > 1)} of numbers" + ("" if header.names else " without names")
+        named = f": {', '.join(header.names.cells)[:200]}" if header.names else ""
+        beside = " put NAME.csv, which holds the time, beside it," if source.lower().endswith(".wfm.csv") else ""
         raise InputError(
-            f"{source}{header.location}: no column time_s, and no other time column (found: {names[:200]}); name the"
-            f" columns as in {_EXAMPLE}, or export the time as well (Rohde & Schwarz store the time of NAME.Wfm.csv in"
-            " NAME.csv)"
+            f"{source}{header.location}: no column time_s, and no other time column ({found}{named});{beside} name the"
+            f" columns as in {_EXAMPLE}, or give the sampling rate, as --rate 100kHz"
         )
     if not header.channels:
         raise InputError(f"{source}{header.location}: there is no column of numbers except the time; export channels")
@@ -68,6 +80,7 @@ def parse_number(cell: str, decimal_comma: bool) -> float | None:
     """Return the cell as a number, or None; some manufacturers write infinity for a value out of range."""
     if "_" in cell:  # Python would read 1_000
         return None
+    cell = cell.replace(MINUS, "-")
     try:
         return float(cell.replace(",", ".") if decimal_comma else cell)
     except ValueError:
@@ -86,6 +99,8 @@ class Header:
     numeric: frozenset[int]  # indices of the columns of numbers
     source: str
     maker: str = "text"
+    rate: float | None = None  # stated by the user, Hz
+    is_clock: bool = False  # whether the time column holds seconds since midnight
 
     @classmethod
     def from_text(cls, text: str, sidecar_text: str, source: str) -> "Header":
@@ -101,6 +116,10 @@ class Header:
         patterns = collections.Counter(p for p in places[len(places) // 2 :] if p)
         numeric = patterns.most_common(1)[0][0] if patterns else frozenset()
         full = [numeric <= p for p in places]
+        if 0 not in numeric and 1 in numeric:  # a word before numbers is a key where most rows have none
+            words = [bool(row.cells[0]) for row, is_full in zip(data, full, strict=True) if is_full]
+            if 2 * sum(words) < len(words):
+                full = [is_full and not row.cells[0] for row, is_full in zip(data, full, strict=True)]
         first = next((i for i, here in enumerate(full) if here and all(full[i : i + 2])), None)
         if first is None:  # no two such rows in succession
             first = full.index(True) if numeric else len(full)
@@ -171,7 +190,8 @@ class Header:
         if self.comments and self.comments[-1].number and not self.units:
             cells = split_cells(self.delimiter.join(self.comments[-1].cells).lstrip("# "), self.delimiter)
             row = TextRow(self.comments[-1].number, cells)
-            if len(cells) == self.width and self._is_names(row):
+            is_key = len(cells) == 1 and re.search("[:=]", cells[0])
+            if len(cells) == self.width and not is_key and self._is_names(row):
                 return row
         return None
 
@@ -179,6 +199,8 @@ class Header:
         here = [row.cells[i] for i in sorted(self.numeric)]
         if any(layouts.split_name_and_unit(cell)[0].lower() in layouts.TIME_NAMES for cell in here if cell):
             return True  # although the other cells may be numbers (Keysight)
+        if all(re.fullmatch(r"[\d:./ -]+", cell) for cell in here):  # dates or clock times
+            return False
         return any(here) and all(parse_number(cell, self.decimal_comma) is None for cell in here)
 
     @functools.cached_property
@@ -204,14 +226,16 @@ class Header:
             return values[0] if values else self.find_quantity(keys)
 
         step, rate = find(layouts.STEP_KEYS), find(layouts.RATE_KEYS)
-        if step is None and rate:
-            step = 1.0 / rate
+        if step is None and (rate or self.rate):
+            step = 1.0 / (rate or self.rate or math.nan)
         return find(layouts.START_KEYS), step if step is not None and 0.0 < step < float("inf") else None
 
     @functools.cached_property
     def _columns(self) -> list[Column]:
         """Columns of numbers, with the unit from their name or from the row of units."""
         made = []
+        if self._repeats_time:
+            return [Column(0, "time", ""), *(Column(i, f"column {i + 1}", "") for i in range(1, self.width, 2))]
         for place in sorted(self.numeric):
             cell, below = (row.cells[place] if row else "" for row in (self.names, self.units))
             name, unit = layouts.split_name_and_unit(cell)
@@ -223,6 +247,16 @@ class Header:
                 )
             made.append(Column(place, name, unit or below))
         return made
+
+    @functools.cached_property
+    def _repeats_time(self) -> bool:
+        """Whether each column without a name follows one with the same times, as ngspice's wrdata writes them."""
+        if self.names or self.units or self.width < 4 or self.width % 2 or len(self.numeric) < self.width:
+            return False
+        rows = [row.cells for row in self.data_rows if len(row.cells) == self.width]
+        times = [parse_number(cells[0], self.decimal_comma) or 0.0 for cells in rows]
+        same = all(len(set(cells[::2])) == 1 for cells in rows)
+        return same and len(times) > 2 and all(a < b for a, b in itertools.pairwise(times))
 
     @functools.cached_property
     def channels(self) -> list[Column]:
@@ -280,8 +314,17 @@ class Header:
         return abs(numbers[1] - numbers[0] - step) < 1e-3 * step
 
     @functools.cached_property
+    def clock(self) -> int | None:
+        """Column of seconds since midnight with nine decimals, as times of day are written, or None."""
+        rows = [row.cells for row in self.data_rows[:8]]
+        places = (i for i in sorted(self.numeric) if all(re.fullmatch(r"\d+\.\d{9}", c[i]) for c in rows if len(c) > i))
+        return next(places, None)
+
+    @functools.cached_property
     def time(self) -> Column | None:
         """Time column, found by name, by unit, or as the first under a header; None if `time_grid` gives the time."""
+        if self.is_clock:
+            return Column(self.clock or 0, "time", "s")
         candidates = [c for c in self._columns if not self._is_index(c)]
         times = [c for c in candidates if c.name.lower() == "time"]
         times += [c for c in candidates if (layouts.parse_unit(c.unit) or ("",))[0] == "s"]

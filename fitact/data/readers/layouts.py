@@ -48,13 +48,16 @@ COUNT_KEYS = (
 )
 STEP_KEYS = (
     "sampleinterval", "increment", "tinc", "timestep", "dt", "tinterval", "xinc", "xincrement", "wfincrement",
-    "signalresolution", "resolution", "samplingperiod",
+    "signalresolution", "resolution", "samplingperiod", "hresolution", "clock", "deltax",
 )  # fmt: skip
 RATE_KEYS = ("samplerate", "samplingrate", "fs", "rate", "samplefrequency", "samplingfrequency")
-START_KEYS = ("start", "t0", "tstart", "xorg", "xorigin", "starttime", "wfstartoffset", "hardwarexstart", "xstart")
+START_KEYS = (
+    "start", "t0", "tstart", "xorg", "xorigin", "starttime", "wfstartoffset", "hardwarexstart", "xstart", "hoffset",
+    "x0",
+)  # fmt: skip
 GRID_KEYS = frozenset(("", *START_KEYS, *STEP_KEYS))
-NAME_KEYS = ("multichannelsource", "source", "channeldata", "label")
-UNIT_KEYS = ("verticalunits", "verticalunit")
+NAME_KEYS = ("multichannelsource", "source", "channeldata", "label", "tracename", "channel")
+UNIT_KEYS = ("verticalunits", "verticalunit", "vunit", "units", "yunitlabel")
 TIME_UNIT_KEYS = ("horizontalunits",)
 ATTENUATION_KEYS = ("probeatten", "probeattenuation", "attenuation")
 SEGMENT_KEYS = ("segments",)
@@ -126,4 +129,4 @@ def is_standard_name(name: str) -> bool:
 def normalize_channel(name: str) -> str:
     """Return the common form of the names "CH2", "Channel 2", "Chan 2" and "2" (Keysight)."""
     bare = re.sub(r"[\s_.-]", "", name.lower())
-    return re.sub(r"^(channel|chan|ch|kanal|canal|ampl|c)(?=[0-9]+$|[a-z]$)", "", bare)
+    return re.sub(r"^(channel|chan|ch|kanal|canal|ampl|column|col|c)(?=[0-9]+$|[a-z]$)", "", bare)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,7 @@ from fitact.data.readers.capture import (
 )
 from fitact.data.readers.layouts import is_same_grid
 from fitact.data.readers.spectrum import is_spectrum, read_spectrum
-from fitact.data.readers.text import is_binary, read_text
+from fitact.data.readers.text import PADDING, is_binary, read_text
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
@@ -67,10 +67,14 @@ def read(
     """
     source, channels = os.fspath(path), channels or {}
     local_columns = {channel: asked for channel, asked in channels.items() if _locate_file_column(path, asked) is None}
-    capture = read_capture(path, lambda names, place: resolve_channels(names, local_columns, source, place).values())
     stated = scene is not None and "sampling_rate" in scene.measurement.model_fields_set
     scene_rate = scene.measurement.sampling_rate if scene is not None and stated else None
-    capture = replace_rounded_times(merge_other_files(capture, path, channels), rate, scene_rate)
+
+    def pick(names: list[str], place: str) -> Iterable[str]:
+        return resolve_channels(names, local_columns, source, place).values()
+
+    capture = read_capture(path, pick, rate or scene_rate)
+    capture = replace_rounded_times(merge_other_files(capture, path, channels, rate or scene_rate), rate, scene_rate)
     record = to_record(capture, channels, scale or {})
     for channel in scene.measurement.channels if scene else ("Vsc",):
         record[channel]  # raises InputError if missing
@@ -83,27 +87,34 @@ def read(
     return record
 
 
-def read_capture(path: str | os.PathLike[str], pick: Pick = lambda names, place: names) -> Capture:
-    """Return time and channels of a file, by the names in the file; `pick` may select some of them."""
+def read_capture(
+    path: str | os.PathLike[str], pick: Pick = lambda names, place: names, rate: float | None = None
+) -> Capture:
+    """Return time and channels of a file, by the names in the file; `pick` may select some of them.
+
+    `rate` (Hz) gives the times of a text file that states none.
+    """
     source, path = os.fspath(path), Path(path)
     head = read_head(path)
     if not head.strip():
         raise InputError(f"{source}: the file holds no data; expected a header such as time_s,V_V,Vsc_V,I_A")
     if head[:2] == b"\x1f\x8b":
-        return read_text(path, source, pick)
-    if is_binary(head) or is_known_binary(head, path.suffix):
+        return read_text(path, source, pick, rate)
+    if is_binary(head.rstrip(PADDING)) or is_known_binary(head, path.suffix):
         return read_binary(path, source, head, pick)
     if is_spectrum(path):
         raise SpectrumFileError(f"{source}: is a spectrum, without time, and this needs a record in time")
-    return read_text(path, source, pick)
+    return read_text(path, source, pick, rate)
 
 
-def merge_other_files(capture: Capture, path: str | os.PathLike[str], channels: Mapping[str, str]) -> Capture:
+def merge_other_files(
+    capture: Capture, path: str | os.PathLike[str], channels: Mapping[str, str], rate: float | None = None
+) -> Capture:
     """Return the capture with the columns of other files that `channels` names as FILE:COLUMN added."""
     traces = list(capture.channels)
     for requested in channels.values():
         if found := _locate_file_column(path, requested):
-            other = _read_column(*found)
+            other = _read_column(*found, rate)
             if not is_same_grid(capture.time, other.time):
                 raise InputError(
                     f"{capture.source}: {found[0]} has a different length or different times, so it does not belong to"
@@ -113,8 +124,8 @@ def merge_other_files(capture: Capture, path: str | os.PathLike[str], channels: 
     return dataclasses.replace(capture, channels=tuple(traces))
 
 
-def _read_column(file: Path, column: str) -> Capture:
-    return read_capture(file, lambda names, _: [find_channel(column, names, str(file))])
+def _read_column(file: Path, column: str, rate: float | None) -> Capture:
+    return read_capture(file, lambda names, _: [find_channel(column, names, str(file))], rate)
 
 
 def _locate_file_column(path: str | os.PathLike[str], requested: str) -> tuple[Path, str] | None:

@@ -10,32 +10,45 @@ import re
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import IO, cast
+from typing import IO, NoReturn, cast
 
 import numpy as np
 from jaxtyping import Float
 
 from fitact.data.readers import layouts
 from fitact.data.readers.capture import Capture, FileChannel, Pick
-from fitact.data.readers.header import Column, Header, parse_number, read_header, split_cells
+from fitact.data.readers.header import MINUS, Column, Header, parse_number, read_header, split_cells
 from fitact.errors import InputError
 from fitact.files import read_error
 from fitact.progress import track_progress
+from fitact.units import format_engineering
 
+PADDING = b"\x00\x1a"  # that some programs write after the text
 _HEAD_BYTES = 32_768  # bytes; enough for any header and some rows
+# a time of day, after which date it may stand; the date counts only by its midnights
+_CLOCK = re.compile(
+    rb"(?:\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}[ T])?(?<!\d)(\d{1,2}):(\d\d):(\d\d(?:\.\d+|,\d+(?=[;\t]))?)"
+    rb"(?: ?([AaPp])[Mm]|Z|[+-]\d\d:?\d\d)?"
+)
+_DAY = 86_400.0  # s
+_THOUSANDS = re.compile(rb'"([-+]?\d{1,3}(?:,\d{3})+(?:\.\d*)?)"')
+MAX_FOOTER_LINES = 20  # more lines of words are no statistics below the data
 BLOCK_BYTES = 8_388_608  # parsed in one block
 
 
-def read_text(path: Path, source: str, pick: Pick, max_bytes: int = 4_294_967_296) -> Capture:
+def read_text(
+    path: Path, source: str, pick: Pick, rate: float | None = None, max_bytes: int = 4_294_967_296
+) -> Capture:
     """Return the columns of a text file (plain or gzip) that `pick` selects, in SI units.
 
-    Text of more than `max_bytes` is refused; it indicates a damaged gzip file.
+    `rate` (Hz) gives the times of a file that states none. Text of more than `max_bytes` is refused; it indicates a
+    damaged gzip file.
     """
     try:
         with _open_text(path, max_bytes) as (stream, file):
             head = stream.read(_HEAD_BYTES)
             stream.seek(0)
-            table = _TableParser.from_head(head, source, pick, read_sidecar(path))
+            table = _TableParser.from_head(head.rstrip(PADDING), source, pick, read_sidecar(path), rate)
             blocks = _blocks(iter(lambda: stream.read(BLOCK_BYTES), b""), source, max_bytes)
             for block in track_progress(blocks, f"reading {source}", path.stat().st_size, file.tell):
                 table.add(block)
@@ -118,6 +131,17 @@ def _decode(head: bytes, source: str) -> str:
         return head[: error.start].decode("utf-8-sig") if cut else head.decode("cp1252", errors="replace")
 
 
+def _write_seconds(clock: re.Match[bytes]) -> bytes:
+    """Return a time of day as seconds since midnight."""
+    hours, minutes, seconds, half = clock.groups()
+    hour = int(hours) if half is None else int(hours) % 12 + 12 * (half in b"Pp")
+    return b"%.9f" % (3600.0 * hour + 60.0 * int(minutes) + float(seconds.replace(b",", b".")))
+
+
+def _join_thousands(text: bytes) -> bytes:
+    return _THOUSANDS.sub(lambda match: match[1].replace(b",", b""), text)
+
+
 def _blocks(parts: Iterator[bytes], source: str, max_bytes: float) -> Iterator[bytes]:
     """Yield whole lines, without the last line feed, from parts that may break lines."""
     rest, size = b"", 0
@@ -144,16 +168,27 @@ class _TableParser:
         self._lines: list[Sequence[int]] = []  # line numbers of the rows of each part
         self._starts = [0]  # number of rows before each part
         self._blank_rows: list[int] = []  # rows with a time but no values
+        self._footer: list[tuple[int, str]] = []  # lines of words below the rows, with their numbers
         self._next_line = 1
+        self._has_thousands = False  # whether quoted numbers have commas between their thousands
+        self._clock_start: float | None = None  # first time of day, s
+        self._clock_end = 0.0  # last time since the first midnight, s
 
     @classmethod
-    def from_head(cls, head: bytes, source: str, pick: Pick, sidecar_text: str) -> "_TableParser":
+    def from_head(
+        cls, head: bytes, source: str, pick: Pick, sidecar_text: str, rate: float | None = None
+    ) -> "_TableParser":
         """Make the parser of the columns that `pick` selects, by the header in the first `_HEAD_BYTES` of a text."""
-        text = _decode(head, source)
+        has_thousands = re.search(rb'"[-+]?\d{1,3}(?:,\d{3})+\.\d+"', head) is not None
+        head = _join_thousands(head) if has_thousands else head
+        is_clock = 2 * len(re.findall(rb"(?m)^.*\d:\d\d:\d\d", head)) > head.count(b"\n")
+        text = _decode(_CLOCK.sub(_write_seconds, head) if is_clock else head, source)
         text = text if len(head) < _HEAD_BYTES else text.rpartition("\n")[0]
-        header = read_header(text, source, sidecar_text)
+        header = read_header(text, source, sidecar_text, rate, is_clock=is_clock)
         wanted = set(pick([column.name for column in header.channels], header.location))
-        return cls(header, [column for column in header.channels if column.name in wanted], source)
+        parser = cls(header, [column for column in header.channels if column.name in wanted], source)
+        parser._has_thousands = has_thousands
+        return parser
 
     def add(self, block: bytes) -> None:
         first, skipped = self._next_line, max(0, self._header.data_rows[0].number - self._next_line)
@@ -163,7 +198,9 @@ class _TableParser:
             if len(parts) <= skipped:
                 return
             first, block = first + skipped, parts[skipped]
-        block = block.replace(b"\r", b"").replace(b'"', b"")
+        block = _join_thousands(block) if self._has_thousands else block
+        block = block.replace(b"\r", b"").replace(b'"', b"").rstrip(PADDING).replace(MINUS.encode(), b"-")
+        block = _CLOCK.sub(_write_seconds, block) if self._header.is_clock else block
         if self._header.delimiter == " ":
             block = re.sub(rb"(?m)^ +| +$", b"", re.sub(rb"[ \t]+", b" ", block))
         numbers, lines = self._parse_fast(block), None
@@ -221,6 +258,12 @@ class _TableParser:
             if not text.strip(delimiter + " ") or text.startswith("#"):
                 continue
             cells = split_cells(text, delimiter)
+            is_word = bool(cells[0]) and parse_number(cells[0], self._header.decimal_comma) is None
+            if self._has_time and is_word and (rows or self._starts[-1]):
+                self._footer.append((line, cells[0]))
+                continue
+            if self._footer:  # rows follow
+                self._refuse_words(*self._footer[0])
             if len(cells) != self._header.width:
                 raise InputError(
                     f"{self._source}, line {line}: {len(cells)} values, but other rows have {self._header.width};"
@@ -235,6 +278,17 @@ class _TableParser:
             )
             lines.append(line)
         return np.array(rows).reshape(len(rows), len(self._column_indices)), lines
+
+    def _refuse_words(self, line: int, words: str) -> NoReturn:
+        """Raise InputError for a line of words among rows of numbers."""
+        if re.match(r"Step Information|Channels|\*\*\*End_of_Header", words):  # LTspice, LabVIEW
+            raise InputError(
+                f"{self._source}, line {line}: holds several runs or segments, the next from '{words[:60]}' on; keep"
+                " one of them in the file, or export one"
+            )
+        raise InputError(
+            f"{self._source}, line {line}, column 1: '{words[:40]}' is not a number; correct or remove the row"
+        )
 
     def _parse_cell(self, cell: str, line: int, place: int) -> float:
         value = parse_number(cell, self._header.decimal_comma)
@@ -256,6 +310,12 @@ class _TableParser:
                 " truncated; export it again"
             )
         kept, notes = self._trim_blank_rows(rows)
+        if self._footer:
+            lines, words = zip(*self._footer, strict=True)
+            if len(lines) > MAX_FOOTER_LINES:
+                self._refuse_words(lines[0], words[0])
+            shown = ", ".join(word[:20] for word in words)
+            notes.append(f"{self._source}: {len(lines)} lines of words below the data were left out ({shown})")
         columns = [column[kept] for column in self._take_columns()]  # `row_label` keeps a reference to the parser
         capture = self._make_capture(columns, np.arange(rows, dtype=float)[kept])
         return dataclasses.replace(
@@ -297,6 +357,25 @@ class _TableParser:
             unread_columns=(*others, *header.non_numeric_columns()),
         )
 
+    def _unwrap_clock(self, time: np.ndarray) -> np.ndarray:
+        """Return times of day in s since the first one, beyond midnights; refuse a clock that repeats its times."""
+        if self._clock_start is None:
+            self._clock_start = self._clock_end = float(time[0])
+        steps = np.diff(time, prepend=self._clock_end % _DAY)
+        steps = np.where(steps < -0.5 * _DAY, steps + _DAY, steps)
+        since = self._clock_end - self._clock_start + np.cumsum(steps)
+        self._clock_end = self._clock_start + float(since[-1])
+        rate, second = self._header.rate, 1.0  # in which clocks are written at least
+        if rate is not None and np.max(np.abs(since - np.arange(since.size) / rate)) <= second:
+            return np.arange(since.size) / rate
+        if rate is None and np.any(steps[1:] == 0.0):
+            coarse = format_engineering(float(np.min(steps[steps > 0.0], initial=np.inf)), "s", 2)
+            raise InputError(
+                f"{self._source}: the times of day have a resolution of {coarse}, in which several rows fall; give the"
+                " sampling rate, as --rate 100kHz, or write more digits"
+            )
+        return since
+
     def _trim_blank_rows(self, rows: int) -> tuple[slice, list[str]]:
         """Return the rows without empty rows at either end, and a note on these."""
         blank = set(self._blank_rows)
@@ -313,6 +392,8 @@ class _TableParser:
     def _time_in_seconds(self, time: np.ndarray) -> tuple[np.ndarray, list[str], list[str]]:
         """Return the times in seconds, with notes and warnings on what was assumed."""
         header, place = self._header, f"{self._source}{self._header.location}"
+        if header.is_clock:
+            return self._unwrap_clock(time), [f"{self._source}: times of day are counted from the first"], []
         if header.time:
             stated = header.time.unit or (header.time.name.lower() == "time" and header.maker == "fitact")
             warnings = [] if stated else [f"{self._source}: the file states no unit of time; seconds were assumed"]

@@ -1,0 +1,169 @@
+"""Files as other people's programs write them: each is read with the written values, or refused for its kind."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fitact
+
+STEP, COUNT = 20e-6, 300
+TIME = STEP * np.arange(COUNT)
+V = 120.0 * np.sin(2.0 * np.pi * 330.0 * TIME) - 3.25
+VSC = 11.0 * np.cos(2.0 * np.pi * 330.0 * TIME) + 0.5
+
+
+def rows(*columns: np.ndarray, form: str = "%.5f", delimiter: str = ",") -> list[str]:
+    return [delimiter.join(form % x for x in row) for row in zip(*columns, strict=True)]
+
+
+def clocks(form: str = "{h:02d}:{m:02d}:{s:09.6f}", begin: float = 86_399.999) -> list[str]:
+    """Return times of day that pass midnight."""
+    since = (begin + TIME) % 86_400.0
+    return [form.format(h=int(t // 3600), m=int(t % 3600 // 60), s=t % 60.0) for t in since]
+
+
+def with_clock(header: str, clock: list[str], **how: str) -> str:
+    lines = zip(clock, rows(V, VSC, **how), strict=True)
+    return "\n".join([header, *(f"{time}{how.get('delimiter', ',')}{row}" for time, row in lines), ""])
+
+
+def half_past(clock: list[str]) -> list[str]:
+    return [f"{int(c[:2]) % 12 or 12}{c[2:]} {'AM' if int(c[:2]) < 12 else 'PM'}" for c in clock]
+
+
+def thousands(x: float) -> str:
+    return f'"{x:,.3f}"'
+
+
+YOKOGAWA = (
+    '"Model Name","DL850"\n"TraceName","CH1","CH2"\n"BlockSize",300,300\n"VUnit","V","V"\n"SampleRate",50000,50000\n'
+    '"HResolution",2.0E-05,2.0E-05\n"HOffset",0.0,0.0\n"DisplayBlockSize",300,300\n"Date","2025/03/04","2025/03/04"\n'
+    '"Time","09:15:59.990","09:15:59.990"\n\n'
+)
+LVM = (
+    "LabVIEW Measurement\nX_Columns\tOne\nChannels\t2\nSamples\t300\t300\nY_Unit_Label\tVolts\tVolts\n"
+    "X_Dimension\tTime\tTime\nX0\t0.0\t0.0\nDelta_X\t0.000020\t0.000020\n***End_of_Header***\t\t\t\n"
+    "X_Value\tV\tVsc\tComment\n"
+)
+LAYOUTS: dict[str, tuple[str, dict[str, object]]] = {
+    "time stamps": (with_clock(",V_V,Vsc_V", [f"2025-03-04 {c}" for c in clocks()]), {}),
+    "ISO time stamps with a zone": (with_clock("when,V_V,Vsc_V", [f"2025-03-04T{c}+01:00" for c in clocks()]), {}),
+    "a date and a clock": (with_clock("Date,Time,V (V),Vsc (V)", [f"04/03/2025,{c}" for c in clocks()]), {}),
+    "a twelve-hour clock": (with_clock("Time,V_V,Vsc_V", half_past(clocks())), {}),
+    "a German clock": (
+        with_clock("Zeit;V_V;Vsc_V", clocks(), delimiter=";").replace(".", ","), {},
+    ),
+    "a coarse clock and a rate": (
+        with_clock("Time,V_V,Vsc_V", [c[:8] for c in clocks(begin=100.0)]), {"rate": 1.0 / STEP},
+    ),
+    "no time and a rate": ("\n".join(["V_V,Vsc_V", *rows(V, VSC)]), {"rate": 1.0 / STEP}),
+    "no names and a rate": (
+        "\n".join(rows(V, VSC)), {"rate": 1.0 / STEP, "channels": {"V": "1", "Vsc": "2"}},
+    ),
+    "thousands in quotes": (
+        "\n".join(
+            ['"Time (us)","V (mV)","Vsc (mV)"']
+            + [",".join(map(thousands, row)) for row in zip(1e6 * TIME, 1e3 * V, 1e3 * VSC, strict=True)]
+        ),
+        {},
+    ),
+    "typographic minus": (
+        "\n".join(["time_s,V_V,Vsc_V", *rows(TIME, V, VSC)]).replace(",-", ",\N{MINUS SIGN}"), {},
+    ),
+    "statistics below": ("\n".join(["time_s,V_V,Vsc_V", *rows(TIME, V, VSC), "Mean,0.1,0.2", "RMS,1,2", ""]), {}),
+    "padding at the end": ("\n".join(["time_s,V_V,Vsc_V", *rows(TIME, V, VSC)]) + "\n\x1a\x00\x00", {}),
+    "wrdata of ngspice": (
+        "\n".join(rows(TIME, V, TIME, VSC, form=" %.8e", delimiter=" ")), {"channels": {"V": "2", "Vsc": "column 4"}},
+    ),
+    "LabVIEW with times": (LVM + "\n".join(rows(TIME, V, VSC, delimiter="\t")), {}),
+    "LabVIEW without times": (
+        LVM.replace("One", "No") + "\n".join("\t" + row for row in rows(V, VSC, delimiter="\t")), {},
+    ),
+    "Yokogawa": (
+        YOKOGAWA + "\n".join("," + row for row in rows(V, VSC)), {"channels": {"V": "CH1", "Vsc": "CH2"}},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_values_are_those_that_were_written(layout: str, tmp_path: Path):
+    text, how = LAYOUTS[layout]
+    path = tmp_path / "record.csv"
+    path.write_text(text, encoding="utf-8", newline="\n")
+    record = fitact.read(path, **how)
+    np.testing.assert_allclose(record.time - record.time[0], TIME, atol=1e-8)
+    np.testing.assert_allclose(record["V"], V, atol=6e-5)
+    np.testing.assert_allclose(record["Vsc"], VSC, atol=6e-5)
+    assert fitact.inspect(path, **how).time.size == COUNT
+
+
+def test_hantek_writes_one_channel_with_its_clock_in_the_header(tmp_path: Path):
+    for name, values in (("a", V), ("b", VSC)):
+        head = f"#CHANNEL:CH1\n#CLOCK=20.000uS\n#SIZE={COUNT}\n#UNITS:V\n"
+        (tmp_path / f"{name}.csv").write_text(head + "\n".join(rows(values)))
+    record = fitact.read(tmp_path / "a.csv", channels={"V": "CH1", "Vsc": "b.csv:CH1"})
+    np.testing.assert_allclose(record.time, TIME, atol=1e-12)
+    np.testing.assert_allclose(record["V"], V, atol=6e-6)
+    np.testing.assert_allclose(record["Vsc"], VSC, atol=6e-6)
+
+
+def test_what_was_left_out_is_noted(tmp_path: Path):
+    path = tmp_path / "record.csv"
+    path.write_text(LAYOUTS["statistics below"][0])
+    assert any("2 lines of words below the data were left out (Mean, RMS)" in note for note in fitact.read(path).notes)
+    path.write_text(LAYOUTS["time stamps"][0])
+    assert any("counted from the first" in note for note in fitact.read(path).notes)
+
+
+def insert(line: str) -> Callable[[list[str]], list[str]]:
+    return lambda lines: [*lines[:100], line, *lines[100:]]
+
+
+REFUSED = {
+    "no time": (["V_V,Vsc_V", *rows(V, VSC)], r"2 columns of numbers: V_V, Vsc_V.*--rate 100kHz"),
+    "no names": (rows(V, VSC), r"2 columns of numbers without names.*--rate 100kHz"),
+    "a coarse clock": (
+        with_clock("Time,V_V,Vsc_V", [c[:11] for c in clocks()]).splitlines(), r"resolution of 10 ms.*--rate 100kHz",
+    ),
+    "steps of a simulation": (
+        insert("Step Information: Rsc=160K  (Run: 2/2)")(["time\tV_V\tVsc_V", *rows(TIME, V, VSC, delimiter="\t")]),
+        r"line 101: holds several runs.*Rsc=160K.*export one",
+    ),
+    "segments of LabVIEW": (
+        [
+            *LVM.splitlines(), *rows(TIME, V, VSC, delimiter="\t"), "",
+            *LVM.splitlines()[2:], *rows(TIME, V, VSC, delimiter="\t"),
+        ],
+        r"several runs or segments, the next from 'Channels' on; keep one",
+    ),
+    "words among rows": (
+        insert("pause,,")(["time_s,V_V,Vsc_V", *rows(TIME, V, VSC)]), r"line 101, column 1: 'pause' is not a number",
+    ),
+    "a page of words below": (
+        ["time_s,V_V,Vsc_V", *rows(TIME, V, VSC), *["remark,1,2"] * 30],
+        r"line 302, column 1: 'remark' is not a number",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_refusals_say_what_was_found_and_what_helps(kind: str, tmp_path: Path):
+    lines, words = REFUSED[kind]
+    path = tmp_path / "record.csv"
+    path.write_text("\n".join(lines))
+    with pytest.raises(fitact.InputError) as refused:
+        fitact.read(path)
+    message = str(refused.value)
+    assert re.search(words, message), message
+    assert "Rohde" not in message
+    assert "NAME.csv" not in message
+
+
+def test_only_a_file_of_rohde_and_schwarz_gets_their_advice(tmp_path: Path):
+    path = tmp_path / "record.Wfm.csv"
+    path.write_text("\n".join(rows(V, VSC)))
+    with pytest.raises(fitact.InputError, match=r"put NAME\.csv, which holds the time, beside it"):
+        fitact.read(path)
