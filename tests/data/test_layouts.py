@@ -167,3 +167,47 @@ def test_only_a_file_of_rohde_and_schwarz_gets_their_advice(tmp_path: Path):
     path.write_text("\n".join(rows(V, VSC)))
     with pytest.raises(fitact.InputError, match=r"put NAME\.csv, which holds the time, beside it"):
         fitact.read(path)
+
+
+FREQUENCY = np.geomspace(20.0, 1e5, 40)
+OMEGA = 2.0 * np.pi * FREQUENCY
+Z = 1.0 / (1.0 / 160e3 + 1j * OMEGA * 22e-9) + 800.0 - 1j / (OMEGA * 1.35e-9)
+Y = 1.0 / Z
+# what an LCR meter shows, by its handbook: series and parallel equivalents of an impedance
+SHOWN = {
+    "Cp": Y.imag / OMEGA, "Cs": -1.0 / (OMEGA * Z.imag), "Lp": -1.0 / (OMEGA * Y.imag), "Ls": Z.imag / OMEGA,
+    "Rp": 1.0 / Y.real, "Rs": Z.real, "G": Y.real, "B": Y.imag, "D": Z.real / abs(Z.imag), "Q": abs(Z.imag) / Z.real,
+}  # fmt: skip
+PAIRS = [
+    *((c, other) for c in ("Cp", "Cs") for other in ("D", "Q")), ("Cp", "G"), ("Cp", "Rp"), ("Cs", "Rs"), ("Ls", "Rs"),
+    ("Lp", "Rp"), ("Lp", "G"), ("G", "B"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("first", "second"), PAIRS)
+def test_pairs_of_an_LCR_meter_are_impedances(first: str, second: str, tmp_path: Path):
+    path = tmp_path / "meter.csv"
+    lines = rows(FREQUENCY, SHOWN[first], SHOWN[second], form="%.9e")
+    path.write_text("\n".join([f"Frequency,{first},{second}", *lines]))
+    spectrum = fitact.read_spectrum(path)
+    np.testing.assert_allclose(spectrum.values, Z, rtol=1e-7)
+    assert f"the impedance follows from {first} and {second}" in spectrum.notes
+
+
+def test_units_and_other_words_of_an_LCR_meter(tmp_path: Path):
+    path = tmp_path / "meter.csv"
+    lines = rows(1e-3 * FREQUENCY, 1e9 * SHOWN["Cs"], 1e-3 * SHOWN["Rs"], form="%.9e")
+    path.write_text("\n".join(["Frequency (kHz),Cs (nF),Rs (kOhm)", *lines]))
+    np.testing.assert_allclose(fitact.read_spectrum(path).values, Z, rtol=1e-7)
+    path.write_text(
+        "\n".join(
+            [
+                "freq/Hz;Cp [pF];Dissipation",
+                *rows(FREQUENCY, 1e12 * SHOWN["Cp"], SHOWN["D"], form="%.9e", delimiter=";"),
+            ]
+        )
+    )
+    np.testing.assert_allclose(fitact.read_spectrum(path).values, Z, rtol=1e-7)
+    degrees = np.degrees(np.angle(Y))
+    path.write_text("\n".join(["f (Hz),|Y| (uS),theta (deg)", *rows(FREQUENCY, 1e6 * np.abs(Y), degrees, form="%.9e")]))
+    np.testing.assert_allclose(fitact.read_spectrum(path).values, Z, rtol=1e-7)

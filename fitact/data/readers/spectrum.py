@@ -5,7 +5,7 @@ import itertools
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -31,6 +31,34 @@ _DECIBEL = re.compile(r"db", re.IGNORECASE)
 _RATIO = re.compile(r"v\s*/\s*v|ratio|\|h\|", re.IGNORECASE)
 _OHM = re.compile(r"[(/_\[\s]([kKMGm]?)\s*(?:(?i:ohms?)|Ω|Ω)")
 _HERTZ = re.compile(r"[(/_\[\s]([kKM]?)(?i:hz)")
+# pairs of an LCR meter, by the names of their columns
+_LCR_NAMES = {
+    name: re.compile(rf"^({pattern})(?![a-z])", re.IGNORECASE)
+    for name, pattern in {
+        "Cp": "c_?p", "Cs": "c_?s", "Lp": "l_?p", "Ls": "l_?s", "Rp": "r_?p", "Rs": "r_?s|esr",
+        "G": "g_?p?|conductance", "B": "b_?p?|susceptance", "Y": r"\|y\||y|admittance",
+        "D": "d|df|tan ?(δ|delta)|dissipation( factor)?", "Q": "q|quality( factor)?",
+    }.items()
+}  # fmt: skip
+_LCR_UNIT = re.compile(r"[(/_\[\s]([fpnuµμmkMG]?)(?:[FHS]|Ω|Ω|(?i:ohms?|farad|henry|siemens))\b")
+_Pair = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # omega (rad/s) and the two values to impedance, ohm
+_LCR_PAIRS: dict[tuple[str, str], _Pair] = {
+    ("Cp", "D"): lambda w, C, D: 1.0 / (w * C * (D + 1j)),
+    ("Cp", "Q"): lambda w, C, Q: 1.0 / (w * C * (1.0 / Q + 1j)),
+    ("Cp", "G"): lambda w, C, G: 1.0 / (G + 1j * w * C),
+    ("Cp", "Rp"): lambda w, C, R: 1.0 / (1.0 / R + 1j * w * C),
+    ("Cs", "D"): lambda w, C, D: (D - 1j) / (w * C),
+    ("Cs", "Q"): lambda w, C, Q: (1.0 / Q - 1j) / (w * C),
+    ("Cs", "Rs"): lambda w, C, R: R - 1j / (w * C),
+    ("Lp", "D"): lambda w, L, D: w * L / (D - 1j),
+    ("Lp", "Q"): lambda w, L, Q: w * L / (1.0 / Q - 1j),
+    ("Lp", "G"): lambda w, L, G: 1.0 / (G - 1j / (w * L)),
+    ("Lp", "Rp"): lambda w, L, R: 1.0 / (1.0 / R - 1j / (w * L)),
+    ("Ls", "D"): lambda w, L, D: w * L * (D + 1j),
+    ("Ls", "Q"): lambda w, L, Q: w * L * (1.0 / Q + 1j),
+    ("Ls", "Rs"): lambda w, L, R: R + 1j * w * L,
+    ("G", "B"): lambda w, G, B: 1.0 / (G + 1j * B),
+}
 _LATE_TABLES = re.compile(r"^(EXPLAIN|EC-Lab|<Application>|\"?ZPLOT|\"?Z60W|\0)")  # first lines of long headers
 
 Rows = Float[np.ndarray, "points columns"]
@@ -43,6 +71,7 @@ class _Layout(NamedTuple):
     places: tuple[int, ...]  # columns that must be numbers
     convert: Callable[[Rows], tuple[np.ndarray, np.ndarray]]  # of these columns to frequency (Hz) and response
     doubt: str = ""  # why the table might be two things
+    note: str = ""  # convention by which an impedance follows from the columns
 
 
 class _Table(NamedTuple):
@@ -220,6 +249,8 @@ def _find_layout(names: list[str]) -> _Layout | None:
         real, imaginary = (_find_name(pattern, names) for pattern in patterns)
         if real is not None and imaginary is not None:
             return _parts_layout((frequency, real, imaginary), [names[i] for i in (frequency, real, imaginary)])
+    if (pair := _pair_layout(names, frequency)) is not None:
+        return pair
     size, phases = _find_name(_MAGNITUDE, names), [i for i, name in enumerate(names) if _PHASE.search(name)]
     if not phases:
         return None
@@ -228,6 +259,37 @@ def _find_layout(names: list[str]) -> _Layout | None:
         places = frequency, size, phases[0]
         return _Layout("impedance", places, lambda x: (hertz(x[:, 0]), factor * x[:, 1] * np.exp(turn * x[:, 2])))
     return _gain_layout(names, frequency, phases)
+
+
+def _pair_layout(names: Sequence[str], frequency: int) -> _Layout | None:
+    """Return the layout of a pair of an LCR meter, such as Cp and D or |Y| and theta, or None."""
+    found = {name: place for name, pattern in _LCR_NAMES.items() if (place := _find_name(pattern, names)) is not None}
+    hertz = _to_hertz(names[frequency])
+
+    def factor(name: str) -> float:
+        prefix = _LCR_UNIT.search(names[found[name]])
+        return PREFIX_FACTORS[prefix[1]] if prefix else 1.0
+
+    for (first, second), impedance in _LCR_PAIRS.items():
+        if first in found and second in found:
+            factors = factor(first), factor(second)
+
+            def convert(x: Rows, impedance: _Pair = impedance, factors: tuple[float, float] = factors) -> Any:
+                f = hertz(x[:, 0])
+                return f, impedance(2.0 * np.pi * f, factors[0] * x[:, 1], factors[1] * x[:, 2])
+
+            places = frequency, found[first], found[second]
+            return _Layout("impedance", places, convert, note=f"the impedance follows from {first} and {second}")
+    phase = _find_name(_PHASE, names)
+    if "Y" in found and phase is not None:
+        scale, turn = factor("Y"), _find_turn(names[phase])
+        return _Layout(
+            "impedance",
+            (frequency, found["Y"], phase),
+            lambda x: (hertz(x[:, 0]), np.exp(-turn * x[:, 2]) / (scale * x[:, 1])),
+            note="the impedance follows from |Y| and theta",
+        )
+    return None
 
 
 def _find_name(pattern: re.Pattern[str], names: Sequence[str]) -> int | None:
@@ -300,7 +362,8 @@ def _to_spectra(layout: _Layout, rows: Rows, source: str, shunt: float | None) -
     with np.errstate(all="ignore"):  # what is not finite is refused below
         frequency, values = layout.convert(rows)
     kept = ~(frequency <= 0.0)
-    notes = (f"{np.count_nonzero(~kept)} rows without a frequency are left out",) if not kept.all() else ()
+    left_out = f"{np.count_nonzero(~kept)} rows without a frequency are left out"
+    notes = tuple(filter(None, ("" if kept.all() else left_out, layout.note)))
     for part in _split_sweeps(frequency[kept]):
         swept, response = frequency[kept][part], values[kept][part]
         if layout.channel == "impedance":
