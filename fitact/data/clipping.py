@@ -24,6 +24,19 @@ def clipping_mask(values: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " s
     return np.convolve(railed, np.ones(2 * margin + 1), mode="same") > 0.5
 
 
+def replace_codes(values: Float[np.ndarray, " samples"], code: float = 9e36, min_count: int = 9) -> None:
+    """Replace an oscilloscope's codes for values out of range by the largest value within it, in place.
+
+    As many of them, some in a row, count as clipped then (`clipping_mask`); few remain, and a record refuses them.
+    Codes are infinite, or at least `code` in size.
+    """
+    for sign in (1.0, -1.0):
+        beyond = sign * values >= code
+        within = np.abs(values) < code
+        if np.count_nonzero(beyond) >= min_count and longest_run(beyond) >= 4 and within.any():
+            values[beyond] = sign * np.max(sign * values[within])
+
+
 def has_flat_levels(values: Float[np.ndarray, " samples"], max_levels: int = 6, min_fraction: float = 0.95) -> bool:
     """Return whether nearly all samples have one of a few values, as of a square without noise or rounded above it.
 

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import os
+import shlex
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -133,9 +134,21 @@ def inspect(
     notes = (
         *capture.notes,
         *grid_notes(time, capture.source),
-        f"{capture.source}: for a fit, assign the channels {names}, e.g. --channel V=NAME --channel Vsc=NAME",
+        f"{capture.source}: for a fit, assign the channels {names}; by their units and sizes, which may mislead:"
+        f" {guess_command(capture)}",
     )
     return _inspect_channels(capture, time, arrays, notes)
+
+
+def guess_command(capture: Capture) -> str:
+    """Return the command that would fit the channels of a file: the largest voltage is V, a current I."""
+    kept = {trace.name: trace.values[np.abs(trace.values) < OVERFLOW] for trace in capture.channels}
+    size = {name: float(np.ptp(values)) if values.size else 0.0 for name, values in kept.items()}
+    currents = [trace.name for trace in capture.channels if trace.unit == "A"]
+    voltages = sorted((name for name in size if name not in currents), key=lambda name: -size[name])
+    guessed = dict(zip(("V", "Vsc"), voltages, strict=False)) | dict(zip(("I",), currents, strict=False))
+    options = (f"--channel {shlex.quote(f'{channel}={name}')}" for channel, name in guessed.items())
+    return " ".join(("fitact fit", shlex.quote(capture.source), *options))
 
 
 def _inspect_channels(
@@ -212,7 +225,10 @@ def check_channel(name: str, unit: str, time: Samples, values: Samples, frequenc
     """Describe doubts about a channel, in sentences; `unit` is V, A or "" if unknown."""
     bad = np.flatnonzero(~np.isfinite(values) | (np.abs(values) >= OVERFLOW))
     if bad.size:
-        return [f"{name} is not finite, or an overflow code, at {bad.size:,} samples; a fit refuses them"]
+        return [
+            f"{name} is not finite, or an overflow code, at {bad.size:,} samples; a fit excludes many in a row of Vsc"
+            " and I as clipped, and refuses others"
+        ]
     spread = float(np.ptp(values))
     if spread == 0.0:
         return [f"{name} is constant at {values[0]:.6g}; is it connected?"]

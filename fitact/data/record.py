@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from fitact import charts
 from fitact.compiled import empty_aligned
-from fitact.data.clipping import clipping_mask
+from fitact.data.clipping import clipping_mask, replace_codes
 from fitact.errors import InputError
 from fitact.tables import Display, to_dataframe
 from fitact.units import format_engineering
@@ -74,6 +74,9 @@ class Record(Display):
         given = {"V": V, "Vsc": Vsc, "I": I, "Ft": Ft}
         channels = {name: _aligned_copy(values) for name, values in given.items() if values is not None}
         _check_shapes(time, channels, source)
+        for name in ("Vsc", "I"):
+            if name in channels:
+                replace_codes(channels[name])
         for name, values in {"time": time, **channels}.items():
             _check_values(values, name, source, where)
         _check_increasing(time, source, where)

@@ -62,7 +62,7 @@ def test_inspect_shows_all_channels_and_draws_them(command, tmp_path: Path):
     content = json.loads(done.stdout)
     assert [channel["name"] for channel in content["channels"]] == ["1", "2"]
     assert content["time_start"] == -0.01
-    assert "--channel V=NAME" in content["notes"][-1]
+    assert "fitact fit" in content["notes"][-1]
     assert matplotlib.image.imread(tmp_path / "record.png").std() > 0.05
     done = command(
         "inspect", SCOPE / "keysight_scope_0.csv", "--channel", "Vsc=CH2", "--scale", "Vsc=10", "--out", "a.jpg"

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.io
 
 import fitact
+from fitact.data.clipping import clipping_mask
 
 STEP, COUNT = 20e-6, 300
 TIME = STEP * np.arange(COUNT)
@@ -108,6 +110,22 @@ def test_hantek_writes_one_channel_with_its_clock_in_the_header(tmp_path: Path):
     np.testing.assert_allclose(record.time, TIME, atol=1e-12)
     np.testing.assert_allclose(record["V"], V, atol=6e-6)
     np.testing.assert_allclose(record["Vsc"], VSC, atol=6e-6)
+
+
+@pytest.mark.parametrize("kind", [np.int16, np.int32, np.uint8, np.float32])
+def test_sound_files_need_their_full_scale(kind: type, tmp_path: Path):
+    path, parts = tmp_path / "card.wav", np.column_stack([V / 200.0, VSC / 20.0])
+    steps = {np.int16: 2**15, np.int32: 2**31, np.uint8: 2**7, np.float32: 1}[kind]
+    written = np.round(steps * parts) + 128 * (kind is np.uint8) if steps > 1 else parts
+    scipy.io.wavfile.write(path, 50_000, written.astype(kind))
+    assigned = {"V": "1", "Vsc": "channel 2"}
+    record = fitact.read(path, channels=assigned, scale={"V": 200.0, "Vsc": 20.0})
+    atol = 0.51 / steps if steps > 1 else 1e-6
+    np.testing.assert_allclose(record.time, TIME, atol=1e-12)
+    np.testing.assert_allclose(record["V"], V, atol=200.0 * atol)
+    np.testing.assert_allclose(record["Vsc"], VSC, atol=20.0 * atol)
+    with pytest.raises(fitact.InputError, match=r"no V; give the full scale, as --scale Vsc=10 for 10 V"):
+        fitact.read(path, channels=assigned, scale={"V": 200.0})
 
 
 def test_what_was_left_out_is_noted(tmp_path: Path):
@@ -211,3 +229,42 @@ def test_units_and_other_words_of_an_LCR_meter(tmp_path: Path):
     degrees = np.degrees(np.angle(Y))
     path.write_text("\n".join(["f (Hz),|Y| (uS),theta (deg)", *rows(FREQUENCY, 1e6 * np.abs(Y), degrees, form="%.9e")]))
     np.testing.assert_allclose(fitact.read_spectrum(path).values, Z, rtol=1e-7)
+
+
+@pytest.mark.parametrize("form", ["polar", "parts"])
+def test_an_AC_analysis_of_LTspice_is_a_gain(form: str, tmp_path: Path):
+    gain = 160e3 / (1.0 + 1j * OMEGA * 3.5e-3) / Z
+    decibels, degrees = 20.0 * np.log10(np.abs(gain)), np.degrees(np.angle(gain))
+    cells = [f"({a:.15e}dB,{b:.15e}\N{DEGREE SIGN})" for a, b in zip(decibels, degrees, strict=True)]
+    if form == "parts":
+        cells = [f"{x.real:.15e},{x.imag:.15e}" for x in gain]
+    lines = ["Freq.\tV(skin)", *(f"{f:.15e}\t{cell}" for f, cell in zip(FREQUENCY, cells, strict=True))]
+    path = tmp_path / "ac.txt"
+    path.write_text("\n".join(lines), encoding="latin-1")
+    spectrum = fitact.read_spectrum(path)
+    assert spectrum.channel == "Vsc"
+    np.testing.assert_allclose(spectrum.frequency, FREQUENCY, rtol=1e-12)
+    np.testing.assert_allclose(spectrum.values, gain, rtol=1e-9)
+    assert any("source of 1 V" in note for note in spectrum.notes)
+
+
+@pytest.mark.parametrize("code", ["9.9e37", "\N{INFINITY}"])
+def test_codes_for_values_out_of_range_are_clipped_samples(code: str, tmp_path: Path):
+    """Of I or Vsc; a single one, or one in V, is refused."""
+    path, beyond = tmp_path / "record.csv", np.abs(VSC) > 10.0
+    lines = rows(TIME, V, VSC)
+    marked = [
+        ",".join([*line.split(",")[:2], code if VSC[i] > 0.0 else f"-{code}"]) if beyond[i] else line
+        for i, line in enumerate(lines)
+    ]
+    path.write_text("\n".join(["time_s,V_V,Vsc_V", *marked]), encoding="utf-8")
+    record = fitact.read(path)
+    assert np.all(clipping_mask(record["Vsc"])[beyond])
+    np.testing.assert_allclose(record["Vsc"][~beyond], VSC[~beyond], atol=6e-6)
+    assert np.max(np.abs(record["Vsc"])) < 10.1
+    for place, field in ((2, "Vsc"), (1, "V")):
+        cells = lines[150].split(",")
+        cells[place] = code
+        path.write_text("\n".join(["time_s,V_V,Vsc_V", *lines[:150], ",".join(cells), *lines[151:]]), encoding="utf-8")
+        with pytest.raises(fitact.InputError, match=rf"line 152: {field} is"):
+            fitact.read(path)

@@ -19,7 +19,7 @@ import lazy_loader
 import numpy as np
 
 from fitact.data.readers import layouts
-from fitact.data.readers.capture import Capture, FileChannel, Pick
+from fitact.data.readers.capture import FULL_SCALE, Capture, FileChannel, Pick
 from fitact.data.readers.matlab import read_mat
 from fitact.errors import InputError
 
@@ -77,7 +77,7 @@ def read_binary(path: Path, source: str, head: bytes, pick: Pick) -> Capture:
 def _find_reader(head: bytes, suffix: str) -> Callable[[Path, str, Pick], Capture] | None:
     readers = {
         b"\x89HDF\r\n\x1a\n": _read_hdf5, b"CDF": _read_netcdf3, b"TDSm": _read_tdms, b"PK\x03\x04": _read_npz,
-        b"MATLAB 7.3": _read_hdf5, b"MATLAB": _read_mat,
+        b"MATLAB 7.3": _read_hdf5, b"MATLAB": _read_mat, b"RIFF": _read_wav,
     }  # fmt: skip
     scope = _read_scope if _SCOPE.search(head) or suffix.lower() in _SCOPE_SUFFIXES else None
     return next((reader for start, reader in readers.items() if head.startswith(start)), scope)
@@ -101,6 +101,24 @@ def _read_scope(path: Path, source: str, pick: Pick) -> Capture:
     _check_one_grid(times, [channel.name for channel in channels], source)
     maker, unread = str(wfm.header_name) or "oscilloscope", tuple(name for name in names if name not in wanted)
     return Capture(source, maker, times[0], tuple(channels), unread_columns=unread)
+
+
+def _read_wav(path: Path, source: str, pick: Pick) -> Capture:
+    """Read a sound file, whose values are parts of the full scale."""
+    rate, data = scipy.io.wavfile.read(path)
+    table = data.reshape(len(data), -1)
+    middle, size = (128.0, 128.0) if data.dtype == np.uint8 else (0.0, 1.0)
+    if data.dtype.kind == "i":
+        size = float(np.iinfo(data.dtype).max) + 1.0
+    names = [f"channel {i + 1}" for i in range(table.shape[1])]
+    wanted = set(pick(names, ""))
+    channels = tuple(
+        FileChannel(name, (table[:, i] - middle) / size, "", FULL_SCALE)
+        for i, name in enumerate(names)
+        if name in wanted
+    )
+    unread = tuple(name for name in names if name not in wanted)
+    return Capture(source, "sound file", np.arange(len(table)) / rate, channels, unread_columns=unread)
 
 
 def _read_tdms(path: Path, source: str, pick: Pick) -> Capture:

@@ -13,6 +13,7 @@ from fitact.data.record import CHANNEL_UNITS, Record, is_rounded_grid
 from fitact.errors import InputError
 from fitact.units import format_engineering
 
+FULL_SCALE = "full scale"  # unit of a file whose values are parts of the range of its converter
 Pick = Callable[[list[str], str], Iterable[str]]  # of the names found, and their place, those that are wanted
 
 
@@ -172,6 +173,13 @@ def to_record(capture: Capture, channels: Mapping[str, str], scale: Mapping[str,
 
 def _check_unit(file_channel: FileChannel, channel: str, scaled: bool, source: str) -> None:
     wanted = CHANNEL_UNITS[channel]
+    if file_channel.unit_text == FULL_SCALE:
+        if scaled:
+            return
+        raise InputError(
+            f"{source}: {file_channel.name} holds parts of the full scale and no {wanted}; give the full scale, as"
+            f" --scale {channel}=10 for 10 {wanted}"
+        )
     if file_channel.unit_text and not file_channel.unit:
         raise InputError(
             f"{source}{file_channel.location}: '{file_channel.unit_text}' is no unit of {channel}; write a multiple"

@@ -90,7 +90,8 @@ def is_spectrum(path: str | os.PathLike[str], head_size: int = 16_384, size: int
         lines = lines[:-1] if len(content) == head_size else lines
         if _LATE_TABLES.search(lines[0] if lines else ""):
             lines = _split_lines(read_head(path, size))
-        return any(True for find in (_find_headers, _find_listings, _find_blocks) for _ in find(lines))
+        finders = _find_headers, _find_ac_analyses, _find_listings, _find_blocks
+        return any(True for find in finders for _ in find(lines))
     except InputError:
         return False
 
@@ -129,6 +130,8 @@ def read_spectra(path: str | os.PathLike[str], shunt: float | None = None) -> tu
         if header.layout.doubt:
             raise InputError(f"{source}, line {header.end}: {header.layout.doubt}")
         spectra += _to_spectra(header.layout, np.array(list(_parse_rows(lines, header, source))), source, shunt)
+    for gains in [] if spectra else _find_ac_analyses(lines):
+        spectra += _to_spectra(_AC_LAYOUT, gains, source, shunt)
     for find in (_find_listings, _find_blocks):
         for block in [] if spectra else find(lines):
             spectra += _to_spectra(_parts_layout((0, 1, 2), ("f", "Z'", "Z''")), block, source, shunt)
@@ -145,6 +148,33 @@ def _split_lines(content: bytes) -> list[str]:
         return content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig").splitlines()
     except UnicodeDecodeError:
         return content.decode("latin-1").splitlines()
+
+
+_AC_LAYOUT = _Layout(
+    "Vsc",
+    (0, 1, 2),
+    lambda x: (x[:, 0], x[:, 1] + 1j * x[:, 2]),
+    note="the gain is that of the AC analysis, for a source of 1 V",
+)
+
+
+def _find_ac_analyses(lines: Sequence[str]) -> Iterator[Rows]:
+    """Yield frequency, real and imaginary part of a voltage in an AC analysis that LTspice exports."""
+    if not lines or not re.match(r"Freq\.\t[^\t]+$", lines[0]):  # one voltage
+        return
+    number = r"([-+]?[\d.]+(?:[eE][-+]?\d+)?)"
+    polar, parts = (re.compile(rf"{number}\t{rest}") for rest in (rf"\({number}dB,{number}\S*\)", f"{number},{number}"))
+    rows = []
+    for line in filter(str.strip, lines[1:]):
+        if match := polar.fullmatch(line.strip()):
+            frequency, decibels, degrees = map(float, match.groups())
+            value = 10.0 ** (decibels / 20.0) * np.exp(1j * np.pi / 180.0 * degrees)
+            rows.append([frequency, value.real, value.imag])
+        elif match := parts.fullmatch(line.strip()):
+            rows.append([float(x) for x in match.groups()])
+        else:
+            return
+    yield np.array(rows, dtype=float).reshape(-1, 3)
 
 
 def _find_listings(lines: Sequence[str]) -> Iterator[Rows]:
