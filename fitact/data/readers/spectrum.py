@@ -418,7 +418,8 @@ def _orient_gain(
     """Return the gain, inverted if it is above 1."""
     warnings: tuple[str, ...] = ()
     if np.median(np.abs(values)) > 1.0:
-        values = 1.0 / values
+        with np.errstate(all="ignore"):  # what is not finite is refused below
+            values = 1.0 / values
         warnings = (
             f"{source}: the gain is above 1, which no circuit of resistors and capacitors gives, so the channels are"
             " exchanged; check which of them is V",
