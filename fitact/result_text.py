@@ -256,7 +256,7 @@ def next_measurements(content: dict[str, Any]) -> Rows:
 def _describe_default(source: str) -> tuple[str, str]:
     """Return the change that halves the uncertainty of a default, and what it needs."""
     if source == "unstated gains":
-        return "half the errors of gains", "state your instruments under [instrument], and calibrate them"
+        return "half the errors of gains", "state and calibrate your instruments ([instrument])"
     if source == "unstated stray C":
         return (
             "half the uncertainty of the stray capacitance",
@@ -278,7 +278,8 @@ def next_step(content: dict[str, Any]) -> str:
     if remedies := content["identifiability"]["remedies"]:
         now = max(abs(parameters[name]["sd"] / parameters[name]["q50"]) for name in names)
         then = max(remedies[0]["sd"][name] for name in names)
-        what = f"{', '.join(names)} to {format_percent(then)} (now {format_percent(now)}), gain errors apart"
+        present = format_percent(now) if now < 1.0 else "undetermined"
+        what = f"{', '.join(names)} to {format_percent(then)} (now {present}), gain errors apart"
         return f"Next: {remedies[0]['text']} would give {what}."
     if advice := content["identifiability"]["advice"]:
         return f"Next: {advice}"
@@ -287,7 +288,7 @@ def next_step(content: dict[str, Any]) -> str:
         source = next(iter(sources), "")
         if is_default(source):
             u = format_percent(combine((parameters | content["derived"])[name])["u"])
-            return f"Next: {_describe_default(source)[1]}, since {source} limits {name} to ± {u}."
+            return f"Next: {_describe_default(source)[1]}; the ± {u} of {name} is mostly {source}."
     largest = max(content["budget"]["force_mean"]["components"], key=lambda each: each["u"], default=None)
     return (
         f"Next: the largest source of u of force_mean is {largest['source']}; {largest['reduce_by']}."

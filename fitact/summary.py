@@ -116,7 +116,7 @@ def format_estimate(summary: Summary) -> str:
     size, symbol = choose_prefixed_unit(median, str(s["unit"]))
     if not 0.0 < sd <= abs(median):
         spread = "" if sd == 0.0 else f" (sd {format_sd(s)})"
-        return f"{median / size:.{2 if spread else 4}g} {symbol}".rstrip() + spread
+        return format_engineering(median, str(s["unit"]), 2 if spread else 4) + spread
     value, spread = round_to_sd((median / size, sd / size), rounding_unit(s) / size)
     return f"{value} ± {spread} {symbol}".rstrip()
 

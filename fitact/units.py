@@ -148,7 +148,10 @@ def format_exact(value: float, unit: str) -> str:
 def format_engineering(value: float, unit: str, digits: int = 4) -> str:
     """Return `value` as text with an SI prefix: ``format_engineering(1.35e-9, "F") == "1.35 nF"``."""
     size, symbol = choose_prefixed_unit(value, unit)
-    return f"{value / size:.{digits}g} {symbol}".rstrip()
+    number = value / size
+    if 10.0**digits <= abs(number) < 1000.0:  # which `g` would write with an exponent
+        number, digits = float(f"{number:.{digits}g}"), 4
+    return f"{number:.{digits}g} {symbol}".rstrip()
 
 
 def choose_prefixed_unit(value: float, unit: str) -> tuple[float, str]:
