@@ -3,7 +3,7 @@
 import math
 import shlex
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from fitact.summary import (
@@ -15,6 +15,7 @@ from fitact.summary import (
     format_interval,
     format_range,
     is_default,
+    is_trusted,
 )
 from fitact.tables import align_table, join_lines
 from fitact.units import DERIVED, GEOMETRY, PARAMETERS, format_engineering, format_percent, quantity_unit
@@ -50,7 +51,7 @@ def _has_uncertainty(summary: Summary) -> bool:
 
 def _about(summary: Summary) -> str:
     """Return a value that rests on a default or on an instrument that nobody stated: "about 250 mN"."""
-    rounded = float(f"{summary['q50']:.2g}")
+    rounded = float(f"{summary['q50']:.2g}")  # first, so that 999.6 uN becomes 1 mN
     return f"about {format_engineering(rounded, str(summary['unit']))}"
 
 
@@ -123,8 +124,8 @@ def force_sentences(basis: dict[str, Any]) -> list[str]:
             f" of the prior{stated} and of Tsc, but of no other of these values."
         )
     if other := basis["other_law"]:
-        force = format_engineering(float(f"{other['force_mean']['q50']:.2g}"), "N")
-        sentences.append(f"Mean force by the other law ({FORCE_LAWS[other['law']]}): about {force}, for the same data.")
+        force = _about(other["force_mean"])
+        sentences.append(f"Mean force by the other law ({FORCE_LAWS[other['law']]}): {force}, for the same data.")
     return sentences
 
 
@@ -271,7 +272,7 @@ def _describe_default(source: str) -> tuple[str, str]:
 def next_step(content: dict[str, Any]) -> str:
     """Return the one thing to do next, a sentence."""
     names = result_names(content)
-    if names and not _is_reliable(content):
+    if names and not is_trusted(content):
         return f"Next: {command_to_explain(names[0])} says what to try first."
     parameters = content["parameters"]
     names = [name for name in content["identifiability"]["blind_direction"] if name in parameters]
@@ -284,25 +285,22 @@ def next_step(content: dict[str, Any]) -> str:
     if advice := content["identifiability"]["advice"]:
         return f"Next: {advice}"
     for name in (*names, "force_mean"):
-        sources = combine((parameters | content["derived"])[name]).get("sources", {})
-        source = next(iter(sources), "")
+        combined = combine((parameters | content["derived"])[name])
+        source = next(iter(combined.get("sources", {})), "")
         if is_default(source):
-            u = format_percent(combine((parameters | content["derived"])[name])["u"])
+            u = format_percent(combined["u"])
             return f"Next: {_describe_default(source)[1]}; the ± {u} of {name} is mostly {source}."
-    largest = max(content["budget"]["force_mean"]["components"], key=lambda each: each["u"], default=None)
-    return (
-        f"Next: the largest source of u of force_mean is {largest['source']}; {largest['reduce_by']}."
-        if largest
-        else ""
-    )
+    if components := content["budget"]["force_mean"]["components"]:
+        largest = max(components, key=lambda each: each["u"])
+        return f"Next: the largest source of u of force_mean is {largest['source']}; {largest['reduce_by']}."
+    return ""
 
 
 def verdict_sentence(content: dict[str, Any]) -> str:
     """Return whether the result is reliable and what the data determine, in a sentence."""
     id, fit = content["identifiability"], content["fit"]
-    if not _is_reliable(content):
-        sampled = content.get("convergence", {"converged": True})["converged"]
-        reason = fit["result"] if fit["result"] not in TRUSTED_RESULTS or sampled else "sampling did not converge"
+    if not is_trusted(content):
+        reason = "sampling did not converge" if fit["result"] in TRUSTED_RESULTS else fit["result"]
         return f"Unreliable ({reason}): do not use these numbers."
     if id["verdict"] == "identified":
         return f"Identified: the data determine {_list(list(id['blind_direction']))}."
@@ -358,11 +356,6 @@ def describe_summary(content: dict[str, Any], *, verbose: bool = False) -> str:
 
 def _list(names: Sequence[str]) -> str:
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
-
-
-def _is_reliable(content: Mapping[str, Any]) -> bool:
-    converged = content.get("convergence", {"converged": True})["converged"]
-    return converged and content["fit"]["result"] in TRUSTED_RESULTS
 
 
 def result_names(content: dict[str, Any]) -> list[str]:

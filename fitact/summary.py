@@ -171,5 +171,6 @@ def versions() -> dict[str, str]:
 
 
 def is_trusted(content: dict[str, Any]) -> bool:
-    """Return whether the answer that summary.json holds is reliable."""
-    return bool(content["convergence"]["converged"]) and content["fit"]["result"] in TRUSTED_RESULTS
+    """Return whether the answer that fit.json or summary.json holds is reliable; a fit has no draws to converge."""
+    converged = content["convergence"]["converged"] if "convergence" in content else True
+    return bool(converged) and content["fit"]["result"] in TRUSTED_RESULTS

@@ -47,10 +47,8 @@ def draw_budgets(content: dict[str, Any], bars: int = 5, make: FigureMaker = Fig
     for name, axes in zip(names, panels, strict=False):
         components = list_components(name, content)
         largest = [each for each in components if each["share"] >= 0.001][:bars][::-1]
-        sources, sizes = (
-            [each["source"].partition(" (")[0] for each in largest],
-            [100.0 * each["u"] for each in largest],
-        )
+        sources = [each["source"].partition(" (")[0] for each in largest]
+        sizes = [100.0 * each["u"] for each in largest]
         axes.barh(sources, sizes, color=[ALERT if each["type"] == "A" else MODEL for each in largest])
         u = math.hypot(*(each["u"] for each in components))
         axes.set_title(f"{name}: u = {100.0 * u:.2g} %", fontsize=10.0, loc="left")

@@ -250,7 +250,7 @@ def test_an_AC_analysis_of_LTspice_is_a_gain(form: str, tmp_path: Path):
 
 @pytest.mark.parametrize("code", ["9.9e37", "\N{INFINITY}"])
 def test_codes_for_values_out_of_range_are_clipped_samples(code: str, tmp_path: Path):
-    """Of I or Vsc; a single one, or one in V, is refused."""
+    """A single code in Vsc, or one in V, is refused."""
     path, beyond = tmp_path / "record.csv", np.abs(VSC) > 10.0
     lines = rows(TIME, V, VSC)
     marked = [
