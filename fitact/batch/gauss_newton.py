@@ -20,9 +20,10 @@ from jaxtyping import Array, Bool, Float
 
 from fitact.compiled import jit, map_blocks
 from fitact.fitting.least_squares import NUISANCES
-from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
+from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import Likelihood
+from fitact.likelihood.observable import ChannelInputs
 
 CANDIDATES = (*NUISANCES, "delay", "clock")  # nuisances that a record may need
 _TOLERANCE = 1e-9  # fraction of a column within rounding, if that is all that remains beside others

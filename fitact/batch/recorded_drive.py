@@ -31,9 +31,9 @@ from fitact.fitting.least_squares import MIN_BIC_DECREASE, NUISANCES, bic_decrea
 from fitact.fitting.residual_statistics import interpolation_errors, is_misfit, residual_statistics
 from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics, sum_rows
 from fitact.fitting.result import Fit
-from fitact.likelihood.channel import LINEAR_NUISANCES
 from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import Likelihood
+from fitact.likelihood.observable import LINEAR_NUISANCES
 from fitact.likelihood.projection import MAX_DELAY, is_exactly_uniform
 from fitact.model.circuit import passes_direct_current
 from fitact.model.force import force_constant
@@ -86,18 +86,18 @@ class RecordedDriveProblem(BatchProblem):
         (trace, *others), time, tau = likelihood.channels, record.time, likelihood.evaluate_circuit(fitted.theta).tau
         if others or not fitted.trusted or choice.name != "measured" or choice.steady_state:
             return None
-        is_plain = trace.channel == "Vsc" and trace.noise == "white" and trace.timing in ((), ("delay",))
+        is_plain = trace.channel == "Vsc" and trace.noise == "white" and trace.timing.free in ((), ("delay",))
         has_other_model = isinstance(likelihood.template, WithSkin) or len(tau) > 1
         has_other_model |= passes_direct_current(likelihood.template)
         if has_other_model or not is_plain or time.size > cls.settings.max_samples or not is_exactly_uniform(time):
             return None
         delay = float(likelihood.to_physical(fitted.theta).get("delay", 0.0))
-        origin, margin = round(delay / float(trace.time_step)), MAX_DELAY if trace.timing else 0
+        origin, margin = round(delay / float(trace.timing.step)), MAX_DELAY if trace.timing.free else 0
         shared = SharedFunctions.from_times(time, margin, float(tau[0]), origin)
-        counted = np.flatnonzero(trace.weights[: time.size] == 1.0)
+        counted = np.flatnonzero(trace.samples.weights[: time.size] == 1.0)
         if abs(origin) > MAX_DELAY - AGES or not np.array_equal(counted, np.arange(margin, time.size - margin)):
             return None
-        optional = tuple(name for name in problem.sources[0].optional_nuisances if name not in trace.timing)
+        optional = tuple(name for name in problem.sources[0].optional_nuisances if name not in trace.timing.free)
         linear_sd = np.asarray(problem.likelihood.channels[0].linear_sd) / np.ptp(record["Vsc"])
         places = {
             *np.flatnonzero(linear_sd).tolist(),
@@ -109,9 +109,8 @@ class RecordedDriveProblem(BatchProblem):
         fields = dict.fromkeys((field.name for field in dataclasses.fields(Compression)), 0.0)
         fields |= {"half_width": HALF_WIDTH, "samples": counted.size, "origin": origin, "time_step": shared.time_step}
         table = Compression(**{name: np.asarray(float(value)) for name, value in fields.items()})
-        trace = dataclasses.replace(
-            trace.shorten(), columns=tuple(sorted(places)), compression=table, shift=np.asarray(delay)
-        )
+        trace = trace.shorten().replace_timing(shift=np.asarray(delay))
+        trace = dataclasses.replace(trace, columns=tuple(sorted(places)), compression=table)
         return cls(
             likelihood=likelihood.replace_channel(0, trace),
             derive=fitted.derive,
@@ -228,17 +227,17 @@ class RecordedDriveProblem(BatchProblem):
 
     def _select(self, fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return the fields of compressions, without steps if no delay is fitted."""
-        return fields if self.likelihood.channels[0].timing else fields | {"steps": fields["steps"][:, :0]}
+        return fields if self.likelihood.channels[0].timing.free else fields | {"steps": fields["steps"][:, :0]}
 
     def _needs_delay(
         self, theta: Float[np.ndarray, "records parameters"], factor: Float[np.ndarray, "records n n"]
     ) -> Bool[np.ndarray, " records"]:
         """Return whether a free delay is clearly significant by the BIC, or none is free."""
         channel = self.likelihood.channels[0]
-        if not channel.timing:
+        if not channel.timing.free:
             return np.ones(len(theta), bool)
         place = self.names.index("delay")
-        delay = float(channel.shift) / float(channel.time_step) + theta[:, place]
+        delay = float(channel.timing.shift) / float(channel.timing.step) + theta[:, place]
         z_squared = np.square(delay) / np.sum(np.square(factor[:, place]), axis=1)
         return bic_decrease_from_z(z_squared, self.samples) > 2.0 * MIN_BIC_DECREASE
 

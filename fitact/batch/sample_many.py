@@ -29,9 +29,9 @@ from fitact.compiled import jit, map_blocks
 from fitact.fitting import derived
 from fitact.fitting.derived import DerivedQuantities, derive_draw
 from fitact.fitting.fit import fit
-from fitact.likelihood.channel import LINEAR_NUISANCES
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import scale_information
+from fitact.likelihood.observable import LINEAR_NUISANCES
 from fitact.model.response_table import ResponseTable
 from fitact.sampling.convergence import Convergence, ImportanceWeights, diagnose_weights, pareto_smooth
 from fitact.sampling.ensemble import sample

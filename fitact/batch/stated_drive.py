@@ -21,7 +21,7 @@ from fitact.fitting.derived import DerivedQuantities, log_derivatives
 from fitact.fitting.least_squares import MIN_BIC_DECREASE
 from fitact.fitting.residual_statistics import is_misfit, residual_statistics
 from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics, sum_rows
-from fitact.likelihood.channel import LINEAR_NUISANCES
+from fitact.likelihood.observable import LINEAR_NUISANCES
 from fitact.model.chirp import Chirp
 from fitact.model.circuit import passes_direct_current
 from fitact.model.response_table import NODES, TABLE_HALF_WIDTH
@@ -52,10 +52,11 @@ class StatedDriveProblem(BatchProblem):
             others
             or not isinstance(start, VscEstimate)
             or not math.isfinite(start.b)
-            or trace.n_samples > cls.settings.max_samples
+            or trace.samples.size > cls.settings.max_samples
         ):
             return None
-        is_plain = trace.channel == "Vsc" and trace.noise == "white" and trace.equally_weighted and not trace.timing
+        is_plain = trace.channel == "Vsc" and trace.noise == "white"
+        is_plain &= trace.samples.equally_weighted and not trace.timing.free
         has_other_model = isinstance(likelihood.template, WithSkin) or isinstance(choice.drive, Chirp)
         has_other_model |= passes_direct_current(likelihood.template)
         has_nuisances = (

@@ -12,11 +12,12 @@ from fitact.compiled import jit
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
 from fitact.fitting.residual_statistics import channel_statistics, outliers
-from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
+from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.charge_rows import LAG, estimate_current_noise
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import STUDENT_DOF, student_weight
-from fitact.likelihood.spectrum_channel import join_complex
+from fitact.likelihood.observable import ChannelInputs
+from fitact.likelihood.spectrum_observable import join_complex
 from fitact.model.circuit import Channel, Circuit
 from fitact.model.skin import WithSkin
 from fitact.problem.drive_choice import DriveModel
@@ -80,19 +81,17 @@ class ChannelFit:
         inputs = likelihood.make_inputs(optimum.circuit, theta, channel)
         # the noise is passed as an array, because jit would compile again for every new number
         residuals, white, beta = sample_residuals(channel, inputs, np.asarray(sigma))
-        of_steps = None
-        if channel.charges is not None:  # whose signal has the derivative of the noise of V
-            steps = float(channel.shift) / float(channel.time_step)
-            residuals = estimate_current_noise(channel.charges, np.asarray(white), steps)
-            of_steps = np.where(np.asarray(channel.charges.used) > 0.0, white, np.nan)[: channel.n_samples]
+        samples, of_steps = channel.samples, None
+        unpadded = slice(samples.size)
+        if samples.charges is not None:  # whose signal has the derivative of the noise of V
+            steps = float(channel.timing.shift) / float(channel.timing.step)
+            residuals = estimate_current_noise(samples.charges, np.asarray(white), steps)
+            of_steps = np.where(samples.counted, white, np.nan)[unpadded]
             of_steps = np.append(of_steps[LAG:], np.full(LAG, np.nan))
-        unpadded = slice(channel.n_samples)
-        residuals, weight = residuals[unpadded], None if channel.equally_weighted else channel.weights[unpadded]
-        names = [channel.qualified_name(channel.linear_names[column]) for column in channel.columns]
+        residuals, weight = residuals[unpadded], None if samples.equally_weighted else samples.weights[unpadded]
+        names = [channel.qualified_name(channel.observable.linear_names[column]) for column in channel.columns]
         linear = dict(zip(names, (beta * np.asarray(channel.linear_sd)[list(channel.columns)]).tolist(), strict=True))
-        mask = channel.weights if channel.whitening is None else np.asarray(channel.whitening.mask)
-        mask = mask if channel.charges is None else np.asarray(channel.charges.used)
-        counted = mask[unpadded] > 0.0
+        counted = samples.counted[unpadded]
         white = white[unpadded][counted]
         n_fitted = theta.size * white.size / float(likelihood.count) + len(linear)
         if isinstance(source.record, Spectrum):
@@ -101,15 +100,15 @@ class ChannelFit:
             # AR(1) noise is estimated only from the residuals
             noise = sigma if channel.noise == "ar1" else source.noise
             of_rows: dict[str, float] = {}
-            if channel.charges is not None:
+            if channel.samples.charges is not None:
                 white, of_rows = row_figures(white, channel, inputs, source.in_time)
             # a delayed response lies between the samples of V
-            b = 0.0 if "delay" in channel.timing and channel.charges is None else float(optimum.b)
+            b = 0.0 if "delay" in channel.timing.free and channel.samples.charges is None else float(optimum.b)
             whole = white, source.record.time[counted], noise, n_fitted, _gain(optimum, channel)
             figures = channel_statistics(*whole, source.record, channel.channel, source.choice, b)
             figures |= of_rows
             figures |= _weighted_statistics(channel, residuals, weight, counted, source.record.time, source.noise)
-            if channel.charges is not None:  # at edges and ends, samples of dV/dt are wrong, and rows are not
+            if channel.samples.charges is not None:  # at edges and ends, samples of dV/dt are wrong, and rows are not
                 figures |= {"outliers": 0} | outliers(white, source.record.time[counted], source.noise)
         return cls(
             label=channel.label,
@@ -141,7 +140,7 @@ def _weighted_statistics(
     if weight is not None and np.mean((weight > 0.0) & (weight < 0.7)) > 0.01:
         figures |= {"spectrum_p": 1.0, "line_p": 1.0}
     weighted = residuals if weight is None else residuals * weight
-    if channel.whitening is not None:  # rms of the residuals before the whitening filter
+    if channel.samples.whitening is not None:  # rms of the residuals before the whitening filter
         figures["rms_residual"] = float(np.sqrt(np.mean(weighted[counted] ** 2)))
     if channel.noise == "spectrum":
         figures["quiet_noise"] = noise
@@ -152,10 +151,12 @@ def _weighted_statistics(
 
 def _gain(optimum: CircuitValues, channel: ChannelLikelihood) -> float:
     """Return the factor by which noise of a measured drive enters the channel."""
-    if channel.channel == "Ft" or channel.charges is not None:  # whose sensor hardly follows noise; which contain it
+    if (
+        channel.channel == "Ft" or channel.samples.charges is not None
+    ):  # whose sensor hardly follows noise; which contain it
         return 0.0
     if isinstance(optimum.circuit, WithSkin):  # the gain falls with frequency, and most of the noise is fast
-        return float(np.abs(_channel_gain(optimum.circuit, channel.channel, 1.0 / channel.time_step)))
+        return float(np.abs(_channel_gain(optimum.circuit, channel.channel, 1.0 / channel.timing.step)))
     return abs(float(np.sum(optimum.terms[channel.channel].weight)))
 
 
@@ -168,17 +169,17 @@ def _log_likelihood(
     channel: ChannelLikelihood, residuals: np.ndarray, white_residuals: np.ndarray, sigma: float
 ) -> float:
     """Return the log-likelihood at its maximum over the noise sd; under Student's t, at scale `sigma`."""
-    if channel.charges is not None:
-        gain = np.asarray(channel.charges.gain)[np.asarray(channel.charges.used) > 0.0]
+    samples = channel.samples
+    if samples.charges is not None:
+        gain = np.asarray(samples.charges.gain)[samples.counted]
         return gaussian_log_likelihood(white_residuals, None) + float(np.sum(np.log(gain)))
-    if channel.whitening is None:
-        weights = channel.weights[: residuals.size]
+    if samples.whitening is None:
+        weights = samples.weights[: residuals.size]
         if channel.noise == "student":
             return _student_log_likelihood(residuals, weights, sigma)
         return gaussian_log_likelihood(residuals, weights)
-    used = np.asarray(channel.whitening.mask) > 0.0
-    innovations = white_residuals / float(channel.whitening.taps[0])
-    return gaussian_log_likelihood(innovations, None) + float(np.sum(np.log(channel.weights[used])))
+    innovations = white_residuals / float(samples.whitening.taps[0])
+    return gaussian_log_likelihood(innovations, None) + float(np.sum(np.log(samples.weights[samples.counted])))
 
 
 def gaussian_log_likelihood(residuals: Samples, weight: Samples | None) -> float:
@@ -209,7 +210,7 @@ def sample_residuals(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: A
     """Return the residuals, the whitened residuals, and the linear nuisances in units of their prior sd."""
     white, beta, _ = channel.fit_nuisances(inputs, sigma)
     columns = np.array(channel.columns, dtype=int)
-    residuals = channel.observed - channel.signal(inputs)
+    residuals = channel.samples.observed - channel.signal(inputs)
     residuals = residuals - beta @ (channel.linear_sd[columns, None] * channel.shapes(inputs)[columns])
     if channel.noise == "student":
         white = white * jnp.sqrt(student_weight(white / sigma))

@@ -15,8 +15,9 @@ from jaxtyping import Array, Float
 from fitact.compiled import BatchEvaluator, as_arrays, double_precision, jit, pad_samples, pad_weight
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.likelihood.channel import CHARGES, FIRST_CHARGE, LINEAR_NUISANCES, ChannelInputs, ChannelLikelihood
+from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
+from fitact.likelihood.observable import CHARGES, FIRST_CHARGE, LINEAR_NUISANCES, ChannelInputs, charge_decays
 from fitact.model.circuit import Circuit, charge_ratios
 from fitact.model.drive import Drive, Multitone, Periodic, PiecewiseLinear, Sampled, Sine
 from fitact.model.force import Geometry, electrostatic_force, friction, mean_force, peak_force, summarize
@@ -57,7 +58,7 @@ class DerivedQuantities(eqx.Module):
         is_closed = self.steady_state and isinstance(self.drive, Periodic)
         if is_closed or isinstance(self.drive, ResponseTable) or isinstance(self.likelihood.template, WithSkin):
             return self
-        begin, tau_range = float(self.likelihood.channels[0].time[0]), self.likelihood.tau_range(points)
+        begin, tau_range = float(self.likelihood.channels[0].samples.time[0]), self.likelihood.tau_range(points)
         table = ResponseTable.from_drive(self.drive, self.time, begin, tau_range, self.steady_state)
         return self if table is None else dataclasses.replace(self, drive=table)
 
@@ -113,7 +114,7 @@ class DerivedQuantities(eqx.Module):
         sizes = sizes[: ratios.size] * ratios / inputs.gain
         if isinstance(self.drive, ResponseTable):
             return self.drive.decays(inputs.circuit.terms().tau, sizes)
-        return sizes @ channel.decays(inputs.circuit, self.time)[: ratios.size]
+        return sizes @ charge_decays(inputs.circuit, self.time - channel.samples.time[0])[: ratios.size]
 
     def __call__(
         self, theta: Float[Array, " parameters"], sigma: Float[Array, " channels"], deviate: Array | None = None

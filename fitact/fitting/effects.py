@@ -13,8 +13,9 @@ from fitact.fitting import derived
 from fitact.fitting.channel_fit import ChannelFit
 from fitact.fitting.laplace import Laplace
 from fitact.fitting.least_squares import NUISANCES
-from fitact.likelihood.channel import TIMING_NUISANCES, ChannelLikelihood
+from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.noise import student_weight
+from fitact.likelihood.observable import TIMING_NUISANCES
 from fitact.model.skin import circuit_parameters
 from fitact.uncertainty.channel_series import ChannelSamples, Timing
 from fitact.uncertainty.effect_size import EffectSizes, assess_effects
@@ -60,9 +61,11 @@ def channel_samples(laplace: Laplace, traces: Sequence[ChannelFit]) -> list[Chan
     """Return the residuals of all channels, with what is known of their noise and nuisances."""
     with double_precision():
         taus = np.asarray(laplace.likelihood.evaluate_circuit(laplace.theta).tau)
-    pairs = zip(laplace.likelihood.channels, traces, strict=True)
-    electrical = [(channel, fitted) for channel, fitted in pairs if fitted.channel != "Ft" and channel.charges is None]
-    return [_channel_samples(laplace, channel, fitted, taus) for channel, fitted in electrical]
+    return [
+        _channel_samples(laplace, channel, fitted, taus)
+        for channel, fitted in zip(laplace.likelihood.channels, traces, strict=True)
+        if fitted.channel != "Ft" and channel.samples.charges is None
+    ]
 
 
 def _channel_samples(
@@ -80,21 +83,22 @@ def _channel_samples(
         return tuple((places[name], power) for name, power in coordinates)
 
     rows: dict[str, Any] = {"residuals": fitted.residuals, "weight": weight}
+    whitening = channel.samples.whitening
     if isinstance(record, Spectrum):  # real parts, then imaginary parts
         rows = {name: np.concatenate([x[::2], x[1::2]]) for name, x in rows.items()}
         zeros = np.zeros(2 * len(record))
         rows |= {"time": zeros, "voltage": zeros, "frequency": None, "omega": 2.0 * math.pi * record.frequency}
     else:
         frequency = record.frequency() if choice.periodic else None
-        # noise of V hides a delay
-        voltage = choice.voltage if channel.smooth is None else np.asarray(channel.smooth)[: len(record)]
+        smooth = channel.driven.smooth  # noise of V hides a delay
+        voltage = choice.voltage if smooth is None else np.asarray(smooth)[: len(record)]
         rows |= {"time": record.time, "voltage": voltage, "frequency": frequency}
     return ChannelSamples(
         **rows,
         channel=fitted.channel,
         sigma=fitted.sigma,
         noise=fitted.figures["noise_expected"],
-        taps=np.ones(1) if channel.whitening is None else np.trim_zeros(np.asarray(channel.whitening.taps), "b"),
+        taps=np.ones(1) if whitening is None else np.trim_zeros(np.asarray(whitening.taps), "b"),
         steady_state=choice.steady_state,
         unknown_charge=choice.unknown_charge,
         transient=sum(value for name, value in linear.items() if name.startswith("charge")),
@@ -110,7 +114,7 @@ def _free_timing(laplace: Laplace, channel: ChannelLikelihood, shift: float) -> 
     """Return the free delay and clock of a channel; `shift` (s) is that of the drive before the fit."""
     likelihood, timing = laplace.likelihood, {}
     values = likelihood.to_physical(laplace.theta)
-    for name in channel.timing:
+    for name in channel.timing.free:
         key = channel.qualified_name(name)
         total = float(values[key]) - (shift if name == "delay" else 0.0)
         timing[name] = Timing(likelihood.names.index(key), likelihood.timing[key][1], total)

@@ -11,10 +11,11 @@ from jaxtyping import Array, Float
 from fitact.compiled import jit, pad_samples
 from fitact.fitting.channel_fit import sample_residuals
 from fitact.instrument.effects import PROBE_TIME_CONSTANT, nonlinearity_shapes, nonlinearity_slopes
-from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
+from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.charge_rows import filter_highpass
 from fitact.likelihood.likelihood import Likelihood
-from fitact.likelihood.spectrum_channel import SpectrumChannel
+from fitact.likelihood.observable import ChannelInputs
+from fitact.likelihood.spectrum_observable import SpectrumObservable
 from fitact.model.drive import Sampled
 from fitact.problem.instrument_errors import EFFECTS, V_NONLINEARITY
 from fitact.problem.source import Source
@@ -28,16 +29,17 @@ def fill_effects(
     `noise` is the noise sd of each channel, V or A.
     """
     for i, (channel, source, sigma) in enumerate(zip(likelihood.channels, sources, noise, strict=True)):
-        if channel.effects is not None:
+        if channel.samples.effects is not None:
             channel = channel.without_compression()
             inputs = likelihood.make_inputs(likelihood.evaluate_circuit(theta).circuit, theta, channel)
-            if isinstance(channel, SpectrumChannel):
-                likelihood = likelihood.replace_channel(i, channel.with_compensation(inputs))
-                continue
-            residuals, *_ = sample_residuals(channel.drop_unused_columns(), inputs, np.asarray(sigma))
-            signal = np.asarray(channel.observed) - residuals - np.asarray(inputs.effects) @ channel.effects
-            effects = _effect_functions(channel, inputs, signal[: channel.n_samples], source)
-            likelihood = likelihood.replace_channel(i, dataclasses.replace(channel, effects=effects))
+            if isinstance(channel.observable, SpectrumObservable):
+                effects = channel.observable.compensation_effect(inputs)
+            else:
+                samples = channel.samples
+                residuals, *_ = sample_residuals(channel.drop_unused_columns(), inputs, np.asarray(sigma))
+                signal = np.asarray(samples.observed) - residuals - np.asarray(inputs.effects) @ samples.effects
+                effects = _effect_functions(channel, inputs, signal[: samples.size], source)
+            likelihood = likelihood.replace_channel(i, channel.replace_samples(effects=effects))
     return likelihood
 
 
@@ -51,15 +53,15 @@ def effects_would_change(
     total, ends = 0.0, [likelihood.evaluate_circuit(point) for point in (start, theta)]
     for channel, noise in zip(likelihood.channels, sigma, strict=True):
         # no estimate without time constants
-        if channel.effects is not None and channel.channel in ends[0].terms:
+        if channel.samples.effects is not None and channel.channel in ends[0].terms:
             inputs = [likelihood.make_inputs(e.circuit, x, channel) for e, x in zip(ends, (start, theta), strict=True)]
             terms = [end.terms[channel.channel] for end in ends]
             # weights of both signs may cancel in a sum
             sizes = [float(np.sum(np.abs(t.weight))) + abs(float(t.direct or 0.0)) for t in terms]
             heights = [float(i.gain) * size for i, size in zip(inputs, sizes, strict=True)]
             moved = abs(math.log(heights[1] / heights[0])) + abs(math.log(terms[1].tau[0] / terms[0].tau[0]))
-            added = channel.weights * (np.asarray(inputs[1].effects) @ channel.effects)
-            total = math.hypot(total, moved * float(np.linalg.norm(added[: channel.n_samples])) / float(noise))
+            added = channel.samples.weights * (np.asarray(inputs[1].effects) @ channel.samples.effects)
+            total = math.hypot(total, moved * float(np.linalg.norm(added[: channel.samples.size])) / float(noise))
     return total
 
 
@@ -74,8 +76,8 @@ def _effect_functions(
         frequency = record.frequency() if settled else None
         functions["compensation"] = pad_samples(_highpass(signal, record.time, frequency, settled=settled))
     if not set(V_NONLINEARITY).isdisjoint(names):
-        shapes = nonlinearity_shapes(np.asarray(cast(Sampled, channel.drive).samples))
-        rates = pad_samples(nonlinearity_slopes(record["V"])) if channel.rate is not None else shapes
+        shapes = nonlinearity_shapes(np.asarray(cast(Sampled, channel.driven.drive).samples))
+        rates = pad_samples(nonlinearity_slopes(record["V"])) if channel.samples.rate is not None else shapes
         functions |= zip(V_NONLINEARITY, _respond(channel, inputs, shapes, rates), strict=True)
     return np.stack([functions[name] for name in names])
 
@@ -90,8 +92,11 @@ def _respond(
     """Return the signal for each of these drives (V), whose dV/dt is `rates` times that of the channel's drive."""
     signals = []
     for voltage, rate in zip(voltages, rates, strict=True):
-        drive = dataclasses.replace(channel.drive, samples=voltage)  # type: ignore[call-arg]
-        changed = dataclasses.replace(channel, drive=drive, rate=None if channel.rate is None else rate * channel.rate)
+        drive = dataclasses.replace(channel.driven.drive, samples=voltage)  # type: ignore[call-arg]
+        follows = channel.samples.rate is not None
+        changed = channel.replace_observable(drive=drive).replace_samples(
+            rate=rate * channel.samples.rate if follows else None
+        )
         signals.append(changed.signal(dataclasses.replace(inputs, effects=None)))
     return signals
 

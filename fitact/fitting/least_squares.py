@@ -16,10 +16,11 @@ from fitact.experiment.fisher import covariance_factor
 from fitact.fitting.minimum import minimise, result_name
 from fitact.fitting.timing import clock_r_squared, explained_square, free_timing, orthonormal_basis
 from fitact.likelihood.certificate import can_interpolate, expand_student, interpolate_channel, recompress
-from fitact.likelihood.channel import FIRST_CHARGE, TIMING_NUISANCES, ChannelLikelihood
+from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.compression import HUM_FREQUENCIES, Interpolation
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import NoiseModel, fit_ar1, student_curvature, student_weight
+from fitact.likelihood.observable import FIRST_CHARGE, TIMING_NUISANCES
 
 # columns of `LINEAR_NUISANCES` that a fit may add as free parameters, by name; it may also add `TIMING_NUISANCES`
 NUISANCES = {
@@ -134,7 +135,7 @@ def _information_jacobian(
         if channel.is_student:
             z = residual / s
             weight = student_weight(z)
-            weight = weight * channel.mean(student_curvature(z)) / channel.mean(weight)
+            weight = weight * channel.samples.mean(student_curvature(z)) / channel.samples.mean(weight)
             jacobian = jacobian * jnp.pad(jnp.sqrt(weight), (0, len(channel.columns)), constant_values=1.0)[:, None]
         scaled.append(jacobian)
     return tuple(scaled)
@@ -232,10 +233,10 @@ def _solve_coloured_noise(
     likelihood = solved.likelihood
     for i, channel in enumerate(likelihood.channels):
         if channel.noise == "ar1":
-            white = dataclasses.replace(channel.without_compression(), whitening=None)
+            white = channel.without_compression().replace_samples(whitening=None)
             residuals, *_ = _fit_nuisances(white, likelihood.channel_inputs(solved.theta, i), solved.sigma[i])
-            counted = channel.weights > 0.0
-            channel = dataclasses.replace(channel, whitening=fit_ar1(residuals, counted).whitening(counted))
+            counted = channel.samples.weights > 0.0
+            channel = channel.replace_samples(whitening=fit_ar1(residuals, counted).whitening(counted))
             channel = recompress(channel, likelihood.evaluate_circuit(solved.theta))
             likelihood = likelihood.replace_channel(i, channel)
     if likelihood is solved.likelihood:
@@ -288,7 +289,7 @@ def _interpolate(
     solved = least_squares(thin, start, noise, noise_tolerance=0.1)
     root = solved.covariance_factor()
     for i in chosen:
-        size = likelihood.channels[i].n_samples
+        size = likelihood.channels[i].samples.size
         reach = 6.0 + 20.0 * math.sqrt(min(few / size, 1.0))
         channel = interpolate_channel(likelihood, i, solved.theta, root, float(solved.sigma[i]), reach)
         likelihood = likelihood.replace_channel(i, channel)
@@ -310,7 +311,7 @@ def _add_nuisance(solution: LeastSquaresResult, index: int, name: str) -> tuple[
         theta = np.array([theta[before.index(n)] if n in before else 0.0 for n in new])
     else:
         sd = channel.linear_sd.copy()
-        sd[list(NUISANCES[name])] = 10.0 * np.ptp(channel.observed)
+        sd[list(NUISANCES[name])] = 10.0 * np.ptp(channel.samples.observed)
         channel = dataclasses.replace(channel, linear_sd=sd)
     return likelihood.replace_channel(index, channel), theta
 
@@ -341,11 +342,11 @@ def _bic_decreases(
     for i, channel in enumerate(likelihood.channels):
         shapes, free = solution.shapes[i], channel.linear_sd > 0.0
         columns.append(pad_columns(i, shapes[free[list(channel.columns)]]))
-        if "clock" in optional_nuisances[i] and "clock" not in channel.timing:
+        if "clock" in optional_nuisances[i] and "clock" not in channel.timing.free:
             fraction = clock_r_squared(channel, likelihood.channel_inputs(solution.theta, i), sigma[i])
             gains[i, "clock"] = bic_decrease(fraction, float(channel.count), 1)
         for name in optional_nuisances[i]:
-            if name == "delay" and name not in channel.timing:
+            if name == "delay" and name not in channel.timing.free:
                 candidates[i, name] = pad_columns(i, solution.slope[i])
             elif name in NUISANCES and not free[NUISANCES[name][0]]:
                 candidates[i, name] = pad_columns(i, shapes[list(NUISANCES[name])])

@@ -11,10 +11,11 @@ from jaxtyping import Array, Float
 from fitact.compiled import jit, pad_samples
 from fitact.data.record import Record
 from fitact.fitting.least_squares import LeastSquaresResult
-from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
+from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.charge_rows import MAX_STEPS, ChargeRows
 from fitact.likelihood.compression import HUM_FREQUENCIES
 from fitact.likelihood.likelihood import Likelihood
+from fitact.likelihood.observable import ChannelInputs
 from fitact.model.drive import Sampled
 from fitact.problem.recorded_current import Current, RecordedCurrent, set_rows
 from fitact.problem.runs import Rows
@@ -27,7 +28,7 @@ def update_rows(likelihood: Likelihood, solution: LeastSquaresResult, sources: S
     for i, (channel, solved) in enumerate(zip(likelihood.channels, solution.likelihood.channels, strict=True)):
         # nuisances that were added stay: without them, the next fit leaves the optimum and returns by hundreds of steps
         channel = dataclasses.replace(channel, linear_sd=solved.linear_sd)
-        if channel.charges is not None:
+        if channel.samples.charges is not None:
             inputs = solution.likelihood.make_inputs(optimum.circuit, solution.theta, solved)
             beta = np.asarray(_fit_nuisances(solved, inputs, np.asarray(solution.sigma[i]))[1])
             sizes = beta * np.asarray(solved.linear_sd)[list(solved.columns)]
@@ -45,7 +46,7 @@ def _expect_harmonics(channel: ChannelLikelihood, fitted: Float[np.ndarray, " co
     linear_sd = np.array(channel.linear_sd, dtype=float)
     sizes = np.zeros(linear_sd.size)
     sizes[list(channel.columns)] = fitted
-    names = list(channel.linear_names)
+    names = list(channel.observable.linear_names)
     for mains in HUM_FREQUENCIES[:2]:
         first, third = (
             [names.index(f"hum_{order * mains:.0f}Hz_{part}") for part in ("cos", "sin")] for order in (1, 3)
@@ -62,7 +63,7 @@ def _rows_at(
     current, size = RecordedCurrent.from_record(record), len(record)
     full = channel.without_compression()
     skew, inputs = float(inputs.delay) / current.step, dataclasses.replace(inputs, delay=np.zeros(()))
-    delay = float(full.shift) / current.step + float(np.clip(skew, -0.5, 0.5))
+    delay = float(full.timing.shift) / current.step + float(np.clip(skew, -0.5, 0.5))
     delay = float(np.clip(delay, 0.5 - MAX_STEPS, MAX_STEPS - 0.5))
 
     @functools.lru_cache(maxsize=1)
@@ -79,12 +80,13 @@ def _rows_at(
 
 def _with_drive(channel: ChannelLikelihood, current: RecordedCurrent, V: Rows) -> ChannelLikelihood:
     """Return the channel of a current that is 0, with another drive."""
-    assert channel.charges is not None
-    assert isinstance(channel.drive, Sampled)
-    length = np.shape(channel.time)[0]
+    charges, drive = channel.samples.charges, channel.driven.drive
+    assert charges is not None
+    assert isinstance(drive, Sampled)
+    length = np.shape(channel.samples.time)[0]
     rise = np.pad(current.rise(V), (0, length - V.size))
-    charges = dataclasses.replace(channel.charges, observed=np.zeros(length), rate=rise)
-    return dataclasses.replace(channel, drive=Sampled(channel.drive.time, pad_samples(V)), charges=charges)
+    charges = dataclasses.replace(charges, observed=np.zeros(length), rate=rise)
+    return channel.replace_observable(drive=Sampled(drive.time, pad_samples(V))).replace_samples(charges=charges)
 
 
 @jit

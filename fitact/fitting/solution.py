@@ -33,7 +33,7 @@ def solve_problem(
     """
     noise, theta = [source.noise for source in problem.sources], choose_start(problem, start)
     likelihood, end, best, steps = problem.likelihood, None, None, 0
-    has_rows = any(channel.charges is not None for channel in likelihood.channels)
+    has_rows = any(channel.samples.charges is not None for channel in likelihood.channels)
     for round_number in range(max_rounds):
         before, likelihood = theta, fill_effects(likelihood, theta, noise, problem.sources)
         checked = not has_rows or round_number > 0

@@ -10,9 +10,10 @@ from jaxtyping import Array, Float
 
 from fitact.compiled import jit, pad_rows
 from fitact.likelihood.certificate import recompress
-from fitact.likelihood.channel import TIMING_NUISANCES, ChannelInputs, ChannelLikelihood
+from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.likelihood import CircuitValues
 from fitact.likelihood.noise import student_weight
+from fitact.likelihood.observable import TIMING_NUISANCES, ChannelInputs
 from fitact.model.response import highpass
 from fitact.model.skin import constant_skin_circuit
 from fitact.problem.drive_choice import has_ideal_edges, ideal_edge_mask
@@ -35,40 +36,44 @@ def free_timing(
     coordinates; at most `few` samples decide. With ideal edges, only the samples next to them determine a clock error,
     and a delay with it. These samples bound both by a prior, and are then excluded from the fit.
     """
-    edges = _edge_mask(channel) if name == "clock" else np.zeros(channel.time.size, bool)
+    edges = _edge_mask(channel) if name == "clock" else np.zeros(channel.samples.time.size, bool)
     names = TIMING_NUISANCES if edges.any() else (name,)
     units = np.array([float(channel.timing_unit(n)) for n in names])
-    timing = tuple(n for n in TIMING_NUISANCES if n in names or n in channel.timing)
-    channel = dataclasses.replace(channel, timing=timing)
-    channel = recompress(channel.exclude_unknown_drive(), circuit)
+    free = tuple(n for n in TIMING_NUISANCES if n in names or n in channel.timing.free)
+    channel = recompress(channel.replace_timing(free=free).exclude_unknown_drive(), circuit)
     half_widths = {"delay": 1.0 if len(names) > 1 else delay_half_width, "clock": clock_half_width}
     axes = [step * np.arange(-int(w / step), int(w / step) + 1) for w in map(half_widths.__getitem__, names)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(names))
     used = channel
     if edges.any():
-        used = channel.select(np.flatnonzero(edges), channel.weights[edges])
+        used = channel.select(np.flatnonzero(edges), channel.samples.weights[edges])
     elif channel.compression is None:
         used = channel.thin(few)
     squares = _residual_sums_of_squares(used, inputs, names, grid * units)
     # less than the effect of one sample on the wrong side of an edge, whose error is most of the height
-    margin = (0.1 * np.ptp(np.asarray(channel.observed))) ** 2 if edges.any() else squares.min() * 25.0 / used.n_samples
+    margin = squares.min() * 25.0 / used.samples.size
+    if edges.any():
+        margin = (0.1 * np.ptp(np.asarray(channel.samples.observed))) ** 2
     good = grid[squares < squares.min() + margin]
     change = {"delay": 0.0, "clock": 0.0} | dict(zip(names, good.mean(axis=0) * units, strict=True))
-    channel = dataclasses.replace(channel, shift=channel.shift + change["delay"], clock=channel.clock + change["clock"])
-    if (steps := round(float(channel.shift) / float(channel.time_step))) and channel.smooth is not None:
-        channel = recompress(channel.delay_noise(steps, float(np.max(circuit.tau))), circuit)
+    timing = channel.timing
+    shift, clock = timing.shift + change["delay"], timing.clock + change["clock"]
+    channel = channel.replace_timing(shift=shift, clock=clock)
+    if (steps := round(float(shift) / float(timing.step))) and channel.driven.smooth is not None:
+        delayed = channel.driven.delay_noise(steps, float(np.max(circuit.tau)))
+        channel = recompress(dataclasses.replace(channel, observable=delayed), circuit)
     if not edges.any():
         return channel
     timing_sd = np.hypot(good.std(axis=0), step / np.sqrt(12.0))
-    return dataclasses.replace(channel.exclude_samples(edges), timing_sd=timing_sd)
+    return channel.exclude_samples(edges).replace_timing(sd=timing_sd)
 
 
 def _edge_mask(channel: ChannelLikelihood, margin: float = 3.0) -> np.ndarray:
     """Return which samples lie within `margin` steps of an ideal edge and thus determine its time."""
-    if not has_ideal_edges(channel.drive):
-        return np.zeros(channel.time.size, bool)
-    time, step = np.asarray(channel.time) - float(channel.shift), margin * float(channel.time_step)
-    return ideal_edge_mask(channel.drive, time, step)
+    if not has_ideal_edges(channel.driven.drive):
+        return np.zeros(channel.samples.time.size, bool)
+    time, step = np.asarray(channel.samples.time) - float(channel.timing.shift), margin * float(channel.timing.step)
+    return ideal_edge_mask(channel.driven.drive, time, step)
 
 
 def _residual_sums_of_squares(
@@ -139,7 +144,7 @@ def clock_r_squared(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: fl
     It is computed from the samples, because the response table cannot represent the effect of a clock error.
     """
     rows = _clock_regressors(channel.without_compression(), inputs, np.asarray(sigma))
-    used, edges = channel.weights > 0.0, _edge_mask(channel)
+    used, edges = channel.samples.weights > 0.0, _edge_mask(channel)
     r_squared = _r_squared(rows[:, used])
     # a clock error shows at an ideal edge only if the edge has passed a sample; otherwise samples there hide it
     return max(r_squared, _r_squared(rows[:, used & ~edges])) if edges.any() else r_squared
@@ -154,21 +159,21 @@ def _r_squared(rows: np.ndarray) -> float:
 @functools.partial(jit, fast=True)
 def _clock_regressors(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: Array) -> Float[Array, "n samples"]:
     """Return the effect of a clock error, the residuals, and the effects of all circuit and linear parameters."""
-    time = channel.time - (channel.shift + inputs.delay)
+    time = channel.samples.time - (channel.timing.shift + inputs.delay)
     taus = jnp.stack(constant_skin_circuit(inputs.circuit).channel_terms(channel.channel).tau)
 
     def response(log_tau: Array) -> Array:
-        return highpass(channel.drive, time, jnp.exp(log_tau), steady_state=channel.steady_state)
+        return highpass(channel.driven.drive, time, jnp.exp(log_tau), steady_state=channel.driven.steady_state)
 
     responses, tau_slopes = jax.vmap(lambda x: jax.jvp(response, (x,), (jnp.ones_like(x),)))(jnp.log(taus))
     signal = channel.signal(inputs)
-    rise, span = map(jnp.asarray, (jnp.gradient(signal), jnp.gradient(channel.time)))
+    rise, span = map(jnp.asarray, (jnp.gradient(signal), jnp.gradient(channel.samples.time)))
     slope = -rise / jnp.where(span > 0.0, span, 1.0)  # over two samples, so that a jump appears on both sides
     shapes = jnp.where(channel.linear_sd[:, None] > 0.0, channel.shapes(inputs), 0.0)
     # a free delay adds only the slope as a regressor
-    delay = slope if "delay" in channel.timing else jnp.zeros_like(slope)
-    rows = jnp.stack([time * slope, channel.observed - signal, *responses, *tau_slopes, *shapes, delay])
-    rows = channel.apply_whitening(rows)
+    delay = slope if "delay" in channel.timing.free else jnp.zeros_like(slope)
+    rows = jnp.stack([time * slope, channel.samples.observed - signal, *responses, *tau_slopes, *shapes, delay])
+    rows = channel.samples.whiten(rows)
     if channel.noise != "student":
         return rows
     return rows * jnp.sqrt(student_weight(channel.fit_nuisances(inputs, sigma)[0] / sigma))

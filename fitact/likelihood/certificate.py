@@ -12,14 +12,15 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from fitact.compiled import BatchEvaluator, jit, pad_samples
-from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
+from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.compression import BASELINE_NAMES, Compression, GridCompression
-from fitact.likelihood.friction_channel import FrictionChannel
+from fitact.likelihood.friction_observable import FrictionObservable
 from fitact.likelihood.interpolation import interpolate
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import StudentExpansion, fit_student_scale, student_curvature, student_weight
+from fitact.likelihood.observable import ChannelInputs
 from fitact.likelihood.projection import MANY_SAMPLES, compress, is_exactly_uniform, samples_per_period, table_multiple
-from fitact.likelihood.spectrum_channel import SpectrumChannel
+from fitact.likelihood.spectrum_observable import SpectrumObservable
 from fitact.model.circuit import HighpassTerms
 from fitact.model.skin import WithSkin
 
@@ -49,29 +50,30 @@ def compress_channel(
     reason = reason_against_table(channel, start, tolerance)
     if reason:
         return channel, reason
-    samples = slice(channel.n_samples)
-    arrays = channel.drive, np.asarray(channel.time)[samples], np.asarray(channel.observed)[samples]
+    samples, driven = channel.samples, channel.driven
+    part = slice(samples.size)
+    arrays = driven.drive, np.asarray(samples.time)[part], np.asarray(samples.observed)[part]
     how: dict[str, Any] = {
         "student": student,
-        "steady_state": channel.steady_state,
-        "weight": None if channel.equally_weighted else channel.weights[samples],
-        "whitening": channel.whitening and channel.whitening.restrict(samples),
-        "charges": channel.charges and channel.charges.restrict(samples),
-        "rate": None if channel.rate is None else np.asarray(channel.rate)[samples],
-        "effects": None if channel.effects is None else np.asarray(channel.effects)[:, samples],
+        "steady_state": driven.steady_state,
+        "weight": None if samples.equally_weighted else samples.weights[part],
+        "whitening": samples.whitening and samples.whitening.restrict(part),
+        "charges": samples.charges and samples.charges.restrict(part),
+        "rate": None if samples.rate is None else np.asarray(samples.rate)[part],
+        "effects": None if samples.effects is None else np.asarray(samples.effects)[:, part],
     }
     terms = start.terms[channel.channel]
     if isinstance(circuit, WithSkin):
         channel = fold(channel)
         inputs = ChannelInputs(circuit, np.asarray(1.0), np.asarray(0.0), np.asarray(0.0))
-        signal = _signal(channel, inputs)[samples]
+        signal = _signal(channel, inputs)[part]
         slope = -np.gradient(signal, arrays[1])
         compression = compress(*arrays, expected_terms=terms, slope=slope, **how)
         fields = {field.name: getattr(compression, field.name) for field in dataclasses.fields(compression)}
         compression = GridCompression(**fields)
     else:
-        if channel.smooth is not None:
-            smooth = np.asarray(channel.smooth)[samples]
+        if driven.smooth is not None:
+            smooth = np.asarray(driven.smooth)[part]
             how |= {"smooth": smooth, "slope": np.gradient(smooth, arrays[1])}
         compression = compress(*arrays, expected_terms=terms, delayed=_shifts_response(channel), **how)
     return dataclasses.replace(channel, compression=compression), ""
@@ -79,7 +81,7 @@ def compress_channel(
 
 def _shifts_response(channel: ChannelLikelihood) -> bool:
     """Return whether a delay or clock error shifts the response; rows of charges are shifted to first order."""
-    return bool(channel.timing) and channel.charges is None
+    return bool(channel.timing.free) and channel.samples.charges is None
 
 
 _signal = jit(ChannelLikelihood.signal)
@@ -87,11 +89,12 @@ _signal = jit(ChannelLikelihood.signal)
 
 def fold(channel: ChannelLikelihood) -> ChannelLikelihood:
     """Return the channel with its `phases` if drive and samples repeat, where a response is costly."""
-    time = np.asarray(channel.time)[: channel.n_samples]
-    period = samples_per_period(channel.drive, time) if channel.steady_state and channel.rate is None else None
+    samples, driven = channel.samples, channel.driven
+    time = np.asarray(samples.time)[: samples.size]
+    period = samples_per_period(driven.drive, time) if driven.steady_state and samples.rate is None else None
     if period is None:
         return channel
-    return dataclasses.replace(channel, phases=pad_samples(time[:period]), period=np.asarray(period))
+    return channel.replace_samples(phases=pad_samples(time[:period]), period=np.asarray(period))
 
 
 def recompress(channel: ChannelLikelihood, circuit: CircuitValues) -> ChannelLikelihood:
@@ -101,13 +104,13 @@ def recompress(channel: ChannelLikelihood, circuit: CircuitValues) -> ChannelLik
 
 def reason_against_compression(channel: ChannelLikelihood, tolerance: float, min_samples: int = 512) -> str:
     """Return why a channel may not be compressed at all, or ""."""
-    if isinstance(channel, SpectrumChannel):
+    if isinstance(channel.observable, SpectrumObservable):
         return "a spectrum has few points"
-    if isinstance(channel, FrictionChannel):
+    if isinstance(channel.observable, FrictionObservable):
         return "the sensor of the friction has a memory"
     if tolerance == 0.0:
         return "the full sum was requested"
-    if channel.n_samples < min_samples:  # compression would save nothing
+    if channel.samples.size < min_samples:  # compression would save nothing
         return f"the record is shorter than {min_samples} samples"
     return ""
 
@@ -121,7 +124,8 @@ def reason_against_table(
     if isinstance(start.circuit, WithSkin):
         if _shifts_response(channel):
             return _TIMING_REASON
-        if channel.channel == "I" and not channel.follows_samples:  # inner products would lose digits of large weights
+        # inner products would lose digits of large weights
+        if channel.channel == "I" and not channel.observable.follows_samples:
             return "the current of a fractional skin is not tabulated"
         return "a dispersive skin has no time constants" if start.circuit.grid is None else ""
     is_direct = start.terms[channel.channel].direct is not None  # its table has V, which is not delayed
@@ -145,9 +149,9 @@ def expand_student(
         likelihood.evaluate_circuit(theta),
     )
     _, beta, _ = _fit_nuisances(channel, inputs, np.asarray(sigma))
-    size, full = channel.n_samples, channel.without_compression()
-    residuals = (np.asarray(channel.observed) - _model(full, inputs, beta))[:size]
-    counted = channel.weights[:size] > 0.0
+    size, full = channel.samples.size, channel.without_compression()
+    residuals = (np.asarray(channel.samples.observed) - _model(full, inputs, beta))[:size]
+    counted = channel.samples.weights[:size] > 0.0
     free = theta.size / likelihood.count
     sigma = max(fit_student_scale(residuals[counted], counted.sum() * (1.0 - free)), float(channel.noise_floor))
     z = residuals / sigma
@@ -220,15 +224,17 @@ def _inputs(likelihood: Likelihood, points: Array) -> tuple[ChannelInputs, ...]:
 
 def can_interpolate(channel: ChannelLikelihood) -> bool:
     """Return whether a channel without a table may be interpolated, i.e. few samples of a signal cost less than all."""
-    if isinstance(channel, FrictionChannel):  # a sample depends on those before it
+    if isinstance(channel.observable, FrictionObservable):  # a sample depends on those before it
         return False
-    return channel.compression is None and channel.noise != "student" and not channel.follows_samples
+    return channel.compression is None and channel.noise != "student" and not channel.observable.follows_samples
 
 
 def can_delay(channel: ChannelLikelihood, tau: Float[np.ndarray, " terms"]) -> bool:
     """Return whether a compression represents a delay: of a measured drive on a uniform grid, if no tau is short."""
-    time, steps = np.asarray(channel.time)[: channel.n_samples], np.min(tau) / float(channel.time_step)
-    return channel.follows_samples and channel.timing == ("delay",) and steps > 2.0 and is_exactly_uniform(time)
+    if not channel.observable.follows_samples or channel.timing.free != ("delay",):
+        return False
+    time = np.asarray(channel.samples.time)[: channel.samples.size]
+    return bool(np.min(tau) > 2.0 * channel.timing.step) and is_exactly_uniform(time)
 
 
 def certify(
@@ -289,11 +295,11 @@ def certify(
     excesses = np.where(is_expanded, errors, excesses)
     failures = []
     for i, channel in enumerate(restricted):
-        if isinstance(channel, SpectrumChannel):  # exact
+        if isinstance(channel.observable, SpectrumObservable):  # exact
             failures.append("")
             continue
         allowed = tolerance / len(restricted) * (expanded_factor if is_expanded[i] else 1.0)
-        allowed *= 100.0 if channel.charges is not None else 1.0
+        allowed *= 100.0 if channel.samples.charges is not None else 1.0
         failure = _compression_failure(errors[i], excesses[i], allowed)
         failures.append((reasons[i] or _TIMING_REASON) if channel.compression is None else failure)
         likelihood = likelihood.replace_channel(i, channel.without_compression() if failures[i] else channel)
@@ -387,21 +393,21 @@ def _restrict_table(
     as the table does, with an `error` of the signal (V or A). `delay_sd` is in time steps.
     """
     table = channel.compression
-    delay = float(channel.shift) + float(inputs.delay)
+    delay = float(channel.timing.shift) + float(inputs.delay)
     if terms is None or not isinstance(table, Compression) or isinstance(table, GridCompression):
         return channel
     if not np.all(table.covers(np.asarray(terms.tau, dtype=float), delay)):
         return channel
     largest = float(np.sum(np.abs(terms.weight)) * inputs.gain)
     has_charge = max(channel.columns, default=0) >= len(BASELINE_NAMES)
-    charge = float(np.ptp(channel.observed)) / largest if has_charge else 0.0
+    charge = float(np.ptp(channel.samples.observed)) / largest if has_charge else 0.0
     ends = (np.log(terms.tau) + side * reach for side in (-1.0, 1.0))
     low, high = (np.clip(end, table.center - table.half_width, table.center + table.half_width) for end in ends)
     # time constants that may become equal exchange their places, and need one range
     group = np.cumsum(np.append(0, high[1:] < low[:-1]))
     low = np.array([low[group == g].min() for g in group])
     high = np.array([high[group == g].max() for g in group])
-    since = float(table_half_width(delay_sd)) * float(channel.time_step)
+    since = float(table_half_width(delay_sd)) * float(channel.timing.step)
     narrow = table.restrict(
         0.5 * (low + high), 0.5 * (high - low), error / largest, charge=charge, delay=(delay - since, delay + since)
     )

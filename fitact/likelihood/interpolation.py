@@ -8,7 +8,6 @@ J. Sci. Comput. 57 (2013) 604). Twice as many samples are used, and the disagree
 evaluation whether the interpolation holds. Samples that may pass a corner are kept as they are.
 """
 
-import dataclasses
 import functools
 import math
 from collections.abc import Iterator
@@ -21,8 +20,9 @@ import scipy
 from jaxtyping import Array, Bool, Float
 
 from fitact.compiled import jit
-from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
+from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.compression import BASELINE_NAMES, Interpolation, split_functions
+from fitact.likelihood.observable import ChannelInputs
 from fitact.likelihood.projection import (
     Samples,
     WhiteningState,
@@ -54,7 +54,7 @@ def interpolate(
     """
     samples, taps = (
         _samples(channel),
-        None if channel.whitening is None else np.asarray(channel.whitening.taps),
+        None if channel.samples.whitening is None else np.asarray(channel.samples.whitening.taps),
     )
     size, rms = samples.time.size, precision / math.sqrt(samples.time.size)
     timing = np.stack([np.broadcast_to(each, inputs.gain.shape) for each in (inputs.delay, inputs.clock)])
@@ -74,7 +74,7 @@ def interpolate(
     basis, triangle = np.linalg.qr(signals[chosen].T)
     selected, coefficients, surplus = _choose_points(basis)
     without_kept: dict[str, Any] = {
-        "mask" if channel.whitening else "weight": np.where(np.isin(np.arange(size), kept), 0.0, samples.mask)
+        "mask" if channel.samples.whitening else "weight": np.where(np.isin(np.arange(size), kept), 0.0, samples.mask)
     }
     training = jax.tree.map(lambda leaf: leaf[np.append(chosen, 0)], inputs)
     parts = _accumulate(channel, training, np.linalg.inv(triangle), samples._replace(**without_kept), taps)
@@ -88,7 +88,7 @@ def interpolate(
     points = np.append(smooth[selected], needed)
     return Interpolation(
         time=samples.time[points],
-        rate=None if channel.rate is None else samples.rate[points],
+        rate=None if channel.samples.rate is None else samples.rate[points],
         to_rows=scipy.linalg.block_diag(functions.T @ coefficients, filtering),
         surplus=np.pad(surplus, ((0, 0), (0, needed.size))) / rms,
         lowest=lowest,
@@ -104,11 +104,12 @@ def interpolate(
 
 
 def _samples(channel: ChannelLikelihood) -> Samples:
-    part = slice(channel.n_samples)
-    time, observed, weight = (np.asarray(x)[part] for x in (channel.time, channel.observed, channel.weights))
-    rate = np.zeros(time.size) if channel.rate is None else np.asarray(channel.rate)[part]
-    mask = weight if channel.whitening is None else channel.whitening.mask[part]
-    effects = None if channel.effects is None else np.asarray(channel.effects)[:, part]
+    given = channel.samples
+    part = slice(given.size)
+    time, observed, weight = (np.asarray(x)[part] for x in (given.time, given.observed, given.weights))
+    rate = np.zeros(time.size) if given.rate is None else np.asarray(given.rate)[part]
+    mask = weight if given.whitening is None else given.whitening.mask[part]
+    effects = None if given.effects is None else np.asarray(given.effects)[:, part]
     return Samples(time, observed, weight, rate, mask, effects=effects)
 
 
@@ -122,11 +123,11 @@ def _passes_corner(channel: ChannelLikelihood, lowest: np.ndarray, highest: np.n
 @jit
 def _pieces(channel: ChannelLikelihood, delays: Array, clocks: Array) -> Float[Array, "n samples"]:
     """Return numbers of the pieces of the drive on which the samples lie."""
-    drive = channel.drive
+    drive = channel.driven.drive
     wave = drive.wave if isinstance(drive, Burst) else drive
 
     def piece(delay: Array, clock: Array) -> Array:
-        time = channel.drive_time(delay, clock)
+        time = channel.timing.drive_time(channel.samples.time, delay, clock)
         index = jnp.asarray(time >= drive.start_time, dtype=int)
         if isinstance(drive, Burst | Chirp):
             index = index + drive.is_over(time)
@@ -149,7 +150,9 @@ def _signals(channel: ChannelLikelihood, inputs: ChannelInputs) -> Float[Array, 
 @jit
 def _slope(channel: ChannelLikelihood, inputs: ChannelInputs) -> Float[Array, " samples"]:
     """Return the derivative with respect to a delay, or 0 if it is a parameter."""
-    return jnp.zeros_like(channel.time) if "delay" in channel.timing else channel.delay_derivative(inputs)
+    if "delay" in channel.timing.free:
+        return jnp.zeros_like(channel.samples.time)
+    return channel.observable.delay_derivative(channel.samples, inputs)
 
 
 def _choose_signals(signals: Float[np.ndarray, "n samples"], rms: float, most: int) -> np.ndarray | None:
@@ -196,8 +199,8 @@ def _chunk_products(
     ends: tuple[Array, Array],
     filtering: WhiteningState | None,
 ) -> tuple[Array, WhiteningState | None]:
-    rate = None if channel.rate is None else chunk.rate
-    channel = dataclasses.replace(channel, time=chunk.time, observed=chunk.observed, rate=rate, effects=chunk.effects)
+    rate = None if channel.samples.rate is None else chunk.rate
+    channel = channel.replace_samples(time=chunk.time, observed=chunk.observed, rate=rate, effects=chunk.effects)
     signals = jax.vmap(channel.signal)(training)
     baseline = baseline_functions(chunk.time, 0.5 * (ends[0] + ends[1]), 0.5 * (ends[1] - ends[0]))
     slope = _slope(channel, jax.tree.map(lambda leaf: leaf[-1], training))

@@ -19,8 +19,9 @@ from jaxtyping import Array, Bool, Float
 from fitact.compiled import BatchEvaluator, array_module, double_precision, jit
 from fitact.experiment.blind_directions import STRAY
 from fitact.likelihood.calibration import Calibration
-from fitact.likelihood.channel import TIMING_NUISANCES, ChannelInputs, ChannelLikelihood
-from fitact.likelihood.friction_channel import FrictionChannel
+from fitact.likelihood.channel import ChannelLikelihood
+from fitact.likelihood.friction_observable import FrictionObservable
+from fitact.likelihood.observable import TIMING_NUISANCES, ChannelInputs
 from fitact.model.circuit import RC, Channel, Circuit, HighpassTerms
 from fitact.model.force import FRICTION_PARAMETERS
 from fitact.model.skin import (
@@ -72,17 +73,17 @@ class Likelihood(eqx.Module):
     @property
     def _timing(self) -> list[tuple[ChannelLikelihood, str]]:
         """Free delays and clocks, as (channel, nuisance)."""
-        return [(channel, name) for channel in self.channels for name in channel.timing]
+        return [(channel, name) for channel in self.channels for name in channel.timing.free]
 
     @property
     def timing_sd(self) -> list[ArrayLike]:
         """Prior standard deviations of free delays and clocks."""
-        return [channel.timing_sd[TIMING_NUISANCES.index(name)] for channel, name in self._timing]
+        return [channel.timing.sd[TIMING_NUISANCES.index(name)] for channel, name in self._timing]
 
     @property
     def follows_rows(self) -> Bool[np.ndarray, " parameters"]:
         """Mask of the coordinates that are delays of rows of charge."""
-        rows = [channel.charges is not None for channel, _ in self._timing]
+        rows = [channel.samples.charges is not None for channel, _ in self._timing]
         return np.array([*[False] * len(self.prior.names), *rows])
 
     @property
@@ -94,8 +95,11 @@ class Likelihood(eqx.Module):
     @double_precision()
     def timing(self) -> dict[str, tuple[float, float]]:
         """Origin and unit of the coordinate of each free delay (s) and clock (relative), by name."""
-        pairs = [(channel, name, channel.shift if name == "delay" else channel.clock) for channel, name in self._timing]
-        return {t.qualified_name(name): (float(base), float(t.timing_unit(name))) for t, name, base in pairs}
+        found = {}
+        for channel, name in self._timing:
+            origin = channel.timing.shift if name == "delay" else channel.timing.clock
+            found[channel.qualified_name(name)] = float(origin), float(channel.timing_unit(name))
+        return found
 
     @property
     def sigma_names(self) -> tuple[str, ...]:
@@ -198,7 +202,7 @@ class Likelihood(eqx.Module):
     def make_inputs(self, circuit: Circuit, theta: Array, channel: ChannelLikelihood) -> ChannelInputs:
         """Return the inputs of a channel at theta, where the circuit is `circuit`."""
         places = {name: i for i, name in enumerate(self.names)}
-        timing = {n: theta[places[channel.qualified_name(n)]] * channel.timing_unit(n) for n in channel.timing}
+        timing = {n: theta[places[channel.qualified_name(n)]] * channel.timing_unit(n) for n in channel.timing.free}
         xp = array_module(theta)
 
         def log_product(coordinates: tuple[tuple[str, float], ...]) -> Array:
@@ -209,7 +213,7 @@ class Likelihood(eqx.Module):
         inputs = ChannelInputs(circuit, gain, **timing, effects=xp.stack(sizes) if sizes else None, stray=channel.stray)
         if channel.stray is not None and STRAY in places:
             inputs = dataclasses.replace(inputs, stray=xp.exp(theta[places[STRAY]]))
-        if not isinstance(channel, FrictionChannel):
+        if not isinstance(channel.observable, FrictionObservable):
             return inputs
         drive_gain = xp.exp(log_product(channel.drive_gains))
         return dataclasses.replace(inputs, friction=self.friction_parameters(theta), drive_gain=drive_gain)

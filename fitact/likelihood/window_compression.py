@@ -89,7 +89,7 @@ class WindowCompressor:
             baseline = dict(zip(BASELINE_NAMES, evaluate_baseline(time, table.middle, table.half), strict=True))
             functions = np.vstack([_decays(table, time), *(baseline[name] for name in _baseline_names(each))])
             tables.append(table)
-            shared.append(functions if each.charges is None else step_means(functions))
+            shared.append(functions if each.samples.charges is None else step_means(functions))
         return cls(tuple(channels), tuple(tables), time, tuple(shared))
 
     def compress(
@@ -114,7 +114,7 @@ class WindowCompressor:
             functions[-1] = self.tables[i].expected @ responses
             found.append(self._compress_channel(i, late, functions, *pair, has_charge))
         parts, inputs = zip(*found, strict=True)
-        if self.channels[0].charges is None and self.channels[0].whitening is None:
+        if self.channels[0].samples.charges is None and self.channels[0].samples.whitening is None:
             return parts, inputs, None
         decays = _decays(self.tables[0], self.time)[: rank * has_charge]
         sizes = function_sizes(rank, decays=True)
@@ -142,10 +142,11 @@ class WindowCompressor:
             late, count = late - (LAG - 0.5) * step, max(round(float(rows.count)), 1)
         else:
             rate, slope, observed = np.zeros(late.size), np.gradient(functions[-2], step), given
-            whitening = None if channel.whitening is None else _make_filter(channel.whitening, weight, late.size)
+            fitted = channel.samples.whitening
+            whitening = None if fitted is None else _make_filter(fitted, weight, late.size)
             used = weight if whitening is None else whitening.mask
             count = late.size if used is None else int(np.count_nonzero(used))
-            if channel.timing:
+            if channel.timing.free:
                 smooth = smooth_drive(functions[-2], white_noise_sd(functions[-2]))
                 steps = drive_steps(smooth, 0, late.size, MAX_DELAY) / step
         rest = observed - functions[-1] - (0.0 if table.expected_rate is None else table.expected_rate * rate)

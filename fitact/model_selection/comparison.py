@@ -13,7 +13,7 @@ from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
 from fitact.fitting.fit import fit
 from fitact.fitting.result import Fit
-from fitact.model_selection.cross_validation import CrossValidation, cross_validate, likelihood_mask
+from fitact.model_selection.cross_validation import CrossValidation, cross_validate
 from fitact.scene.scene import Scene
 from fitact.summary import round_to_sd
 from fitact.tables import align_table, join_lines
@@ -202,7 +202,7 @@ def _require_same_samples(fits: Mapping[str, Fit]) -> None:
     for name, other in others:
         channels = zip(reference.likelihood.channels, other.likelihood.channels, strict=True)
         for trace, pair in zip(reference.traces, channels, strict=True):
-            differ = np.count_nonzero(np.not_equal(*map(likelihood_mask, pair)))
+            differ = np.count_nonzero(np.not_equal(*(each.samples.counted for each in pair)))
             if differ:
                 raise InputError(
                     f"{first} and {name} do not use the same samples of {trace.channel}: {differ} enter only"

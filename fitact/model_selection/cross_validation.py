@@ -14,14 +14,13 @@ from typing import NamedTuple
 import jax
 import numpy as np
 import scipy
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from fitact.compiled import double_precision, jit, pad_samples
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
 from fitact.fitting.least_squares import least_squares
 from fitact.fitting.result import Fit
-from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import STUDENT_DOF, student_curvature, student_weight
 
@@ -48,13 +47,6 @@ def block_indices(record: Record | Spectrum) -> Int[np.ndarray, " samples"]:
         return np.arange(len(record)) * min(blocks, len(record)) // len(record)
     period = np.floor((since + 0.5 * record.time_step) * frequency).astype(int)
     return np.minimum(period, periods - 1) // -(-periods // blocks)
-
-
-def likelihood_mask(trace: ChannelLikelihood) -> Bool[np.ndarray, " samples"]:
-    """Return a mask of the samples, or rows of charge, that enter the likelihood."""
-    if trace.charges is not None:
-        return np.asarray(trace.charges.used) > 0.0
-    return trace.weights > 0.0 if trace.whitening is None else np.asarray(trace.whitening.mask) > 0.0
 
 
 def cross_validate(fit: Fit, folds: int = 10) -> CrossValidation:
@@ -85,15 +77,13 @@ def cross_validate(fit: Fit, folds: int = 10) -> CrossValidation:
 def _mask_samples(likelihood: Likelihood, masks: list[np.ndarray]) -> Likelihood:
     """Return the likelihood of the masked samples of each channel only."""
     for i, (trace, mask) in enumerate(zip(likelihood.channels, masks, strict=True)):
-        if trace.charges is not None:  # likewise the recursion
-            trace = dataclasses.replace(
-                trace, charges=dataclasses.replace(trace.charges, used=trace.charges.used * mask)
-            )
-        elif trace.whitening is None:
-            trace = dataclasses.replace(trace, weight=trace.weights * mask)
+        charges, whitening = trace.samples.charges, trace.samples.whitening
+        if charges is not None:  # likewise the recursion
+            trace = trace.replace_samples(charges=dataclasses.replace(charges, used=charges.used * mask))
+        elif whitening is None:
+            trace = trace.replace_samples(weight=trace.samples.weights * mask)
         else:  # the whitening filter still runs over all samples
-            whitening = dataclasses.replace(trace.whitening, mask=trace.whitening.mask * mask)
-            trace = dataclasses.replace(trace, whitening=whitening)
+            trace = trace.replace_samples(whitening=dataclasses.replace(whitening, mask=whitening.mask * mask))
         likelihood = likelihood.replace_channel(i, trace)
     return likelihood
 
@@ -121,12 +111,13 @@ class _LinearisedModel(NamedTuple):
         ends = np.cumsum([0, *map(len, shapes)])
         channels, precision = [], np.eye(theta.size + ends[-1])
         for i, (trace, mask) in enumerate(zip(full.channels, masks, strict=True)):
-            by_nuisances = np.zeros((trace.time.size, ends[-1]))
+            by_nuisances = np.zeros((trace.samples.time.size, ends[-1]))
             by_nuisances[:, ends[i] : ends[i + 1]] = -np.asarray(shapes[i]).T
             slope = np.hstack([np.asarray(slopes[i]) @ full.prior_factor, by_nuisances]) / sigma[i]
-            counts, is_student = likelihood_mask(trace), trace.noise == "student"
-            first = 1.0 if trace.whitening is None else abs(float(trace.whitening.taps[0]))
-            scale = trace.weights * first if trace.charges is None else np.asarray(trace.charges.gain)
+            samples, is_student = trace.samples, trace.noise == "student"
+            counts = samples.counted
+            first = 1.0 if samples.whitening is None else abs(float(samples.whitening.taps[0]))
+            scale = samples.weights * first if samples.charges is None else np.asarray(samples.charges.gain)
             with np.errstate(divide="ignore"):
                 log_scale = np.where(counts, np.log(scale / sigma[i]), -np.inf)
             channels.append(_LinearisedChannel(np.asarray(residuals[i]) / sigma[i], slope, log_scale, is_student))

@@ -19,10 +19,12 @@ from fitact.experiment.fisher import Experiment
 from fitact.instrument.classes import typical_gain_u
 from fitact.instrument.effects import INPUT_RANGE
 from fitact.likelihood import certificate
-from fitact.likelihood.channel import CHARGES, FIRST_CHARGE, LINEAR_NUISANCES, ChannelLikelihood
+from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.compression import HUM_FREQUENCIES
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import Autoregression, estimate_quiet_noise, require_uniform
+from fitact.likelihood.observable import CHARGES, FIRST_CHARGE, LINEAR_NUISANCES, DrivenSignal, DriveTiming
+from fitact.likelihood.padded_samples import PaddedSamples
 from fitact.likelihood.smooth_drive import smooth_drive
 from fitact.model.circuit import Channel, Circuit, FinalCircuit, passes_direct_current
 from fitact.model.drive import Sampled
@@ -178,7 +180,7 @@ def _reserve_effects(channel: ChannelLikelihood) -> ChannelLikelihood:
     """Return the channel with effects of instruments that are 0, if there are any."""
     if not channel.effect_sizes:
         return channel
-    return dataclasses.replace(channel, effects=np.zeros((len(channel.effect_sizes), channel.time.size)))
+    return channel.replace_samples(effects=np.zeros((len(channel.effect_sizes), channel.samples.time.size)))
 
 
 def _load_priors(scenes: Sequence[Scene | None]) -> dict[str, Distribution]:
@@ -247,35 +249,32 @@ def _build_channel(
         weight = np.ones(len(record))
     weight = None if weight is None else pad_weight(weight)
     colour, noise = _noise(record, channel, scene)
-    nuisances = _prior_of_nuisances(record, choice, scene, channel, len(taus) if choice.unknown_charge else 0)
     # edges of a shifted drive are known only to within a step, which affects g; samples of I there are excluded
-    timing = ("delay",) if channel == "Vsc" and (choice.shift != 0.0 or _has_skew(record, scene)) else ()
+    free = ("delay",) if channel == "Vsc" and (choice.shift != 0.0 or _has_skew(record, scene)) else ()
     has_stray = channel == "I" and (scene.stray_capacitance() > 0.0 or STRAY in bare.prior.names)
+    smooth = _smooth_drive(record) if channel == "Vsc" and _can_smooth(choice, template) else None
+    shift, step = (np.asarray(each, dtype=float) for each in (choice.shift, record.time_step))
+    timing = DriveTiming(shift, np.zeros(()), step, _timing_sd(record, choice, scene, channel), free)
+    linear_sd, noise_floor = _prior_of_nuisances(record, choice, scene, channel, len(taus) * choice.unknown_charge)
     likelihood = ChannelLikelihood(
-        **nuisances,
-        stray=np.asarray(scene.stray_capacitance()) if has_stray else None,
-        time=pad_samples(record.time),
-        observed=pad_samples(record[channel]),
-        weight=weight,
-        whitening=colour and colour.whitening(np.ones(len(record), bool) if weight is None else weight > 0.0),
-        rate=None if begun.slope is None else pad_samples(begun.slope),
-        drive=choice.drive,
-        shift=np.asarray(choice.shift, dtype=float),
-        clock=np.zeros(()),
-        time_step=np.asarray(record.time_step, dtype=float),
-        compression=None,
-        expansion=None,
+        samples=PaddedSamples(
+            time=pad_samples(record.time),
+            observed=pad_samples(record[channel]),
+            weight=weight,
+            whitening=colour and colour.whitening(np.ones(len(record), bool) if weight is None else weight > 0.0),
+            rate=None if begun.slope is None else pad_samples(begun.slope),
+        ),
+        observable=DrivenSignal(choice.drive, timing, channel, choice.steady_state, smooth),
+        linear_sd=linear_sd,
+        noise_floor=noise_floor,
         label=label,
-        channel=channel,
-        steady_state=choice.steady_state,
-        timing=timing,
         noise=scene.measurement.noise_model,
         columns=tuple(range(len(LINEAR_NUISANCES))),
-        smooth=_smooth_drive(record) if channel == "Vsc" and _can_smooth(choice, template) else None,
+        stray=np.asarray(scene.stray_capacitance()) if has_stray else None,
     )
     if channel == "Ft":
-        likelihood = make_friction_channel(likelihood, record, scene, choice, float(taus[0]))
-    if timing:
+        likelihood = make_friction_channel(likelihood, record, scene, choice, template, float(taus[0]))
+    if free:
         likelihood = likelihood.exclude_unknown_drive()
     # an offset of the friction would be mistaken for the normal force
     optional = ("drift", *_hum(record, choice), "crosstalk" if channel == "Ft" else "offset")
@@ -356,15 +355,14 @@ def _make_charge_rows(
     rows, V = current.make_rows(modelled, respond_to(current, estimate, stray), nuisances)
     # converters take channels in turn, and probes delay them
     delay_sd = max(1.0, scene.skew_limit("I", record.time_step) / record.time_step)
+    timing = dataclasses.replace(channel.timing, free=("delay",), sd=np.array([delay_sd, channel.timing.sd[1]]))
+    channel = channel.replace_samples(whitening=None).replace_observable(
+        drive=Sampled(channel.samples.time, pad_samples(V)), steady_state=False, timing=timing
+    )
     channel = dataclasses.replace(
         channel,
-        drive=Sampled(channel.time, pad_samples(V)),
-        steady_state=False,
         noise="white",
-        whitening=None,
         linear_sd=linear_sd,
-        timing=("delay",),
-        timing_sd=np.array([delay_sd, channel.timing_sd[1]]),
         # residuals of runs of equal values are no measure of the noise
         noise_floor=np.asarray(current.noise_I * (1.0 if current.is_coarse else 0.5)),
     )
@@ -423,14 +421,19 @@ def _has_skew(record: Record, scene: Scene, min_part: float = 0.01) -> bool:
 
 def _prior_of_nuisances(
     record: Record, choice: DriveModel, scene: Scene, channel: str, n_charges: int
-) -> dict[str, Any]:
-    """Return the noise floor and the prior sds of linear nuisances, delay and clock, by their field in a channel."""
+) -> tuple[Float[np.ndarray, " nuisances"], np.ndarray]:
+    """Return the prior sds of linear nuisances, and the noise floor."""
     peak_to_peak = float(np.ptp(record[channel]))
     linear_sd = np.zeros(len(LINEAR_NUISANCES))
     linear_sd[FIRST_CHARGE : FIRST_CHARGE + n_charges] = 10.0 * peak_to_peak  # wide
     # a fraction of a period cannot determine an offset, so its prior is the accuracy of an oscilloscope (2 %)
     linear_sd[0] = 0.02 * peak_to_peak if record.frequency() is None and choice.periodic else 0.0
     linear_sd[0] = max(linear_sd[0], INPUT_RANGE * peak_to_peak * scene.offset_limit(channel) / math.sqrt(3.0))
+    return linear_sd, np.asarray(max(MIN_RELATIVE_NOISE * peak_to_peak, rounding_noise_sd(record[channel])))
+
+
+def _timing_sd(record: Record, choice: DriveModel, scene: Scene, channel: str) -> Float[np.ndarray, "2"]:
+    """Return the prior sds of delay and clock, in their units."""
     # in time steps at the ends of the record; the frequency of the drive is known to one or two steps
     clock_sd = 5.0
     if channel == "Vsc" and choice.name != "measured":
@@ -440,11 +443,7 @@ def _prior_of_nuisances(
     if _has_skew(record, scene):
         step_sd = delay_sd if choice.shift != 0.0 else 0.0
         delay_sd = math.hypot(step_sd, scene.skew_limit("Vsc", record.time_step) / record.time_step / math.sqrt(3.0))
-    return {
-        "noise_floor": np.asarray(max(MIN_RELATIVE_NOISE * peak_to_peak, rounding_noise_sd(record[channel]))),
-        "linear_sd": linear_sd,
-        "timing_sd": np.array([delay_sd, clock_sd]),
-    }
+    return np.array([delay_sd, clock_sd])
 
 
 def _hum(record: Record, choice: DriveModel) -> list[str]:

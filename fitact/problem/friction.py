@@ -9,8 +9,10 @@ from fitact.compiled import as_arrays
 from fitact.data.record import Record, is_uniform
 from fitact.errors import InputError
 from fitact.likelihood import certificate
-from fitact.likelihood.channel import FIRST_CHARGE, LINEAR_NUISANCES, ChannelLikelihood
-from fitact.likelihood.friction_channel import FrictionChannel
+from fitact.likelihood.channel import ChannelLikelihood
+from fitact.likelihood.friction_observable import FrictionObservable
+from fitact.likelihood.observable import FIRST_CHARGE, LINEAR_NUISANCES
+from fitact.model.circuit import Circuit
 from fitact.model.force import FRICTION_PARAMETERS
 from fitact.problem.drive_choice import DriveModel
 from fitact.problem.starting_point import estimate_from_vsc
@@ -18,8 +20,8 @@ from fitact.scene.scene import Scene
 
 
 def make_friction_channel(
-    channel: ChannelLikelihood, record: Record, scene: Scene, choice: DriveModel, tau: float
-) -> FrictionChannel:
+    channel: ChannelLikelihood, record: Record, scene: Scene, choice: DriveModel, template: Circuit, tau: float
+) -> ChannelLikelihood:
     """Return the channel with the friction that the scene describes.
 
     The samples that the unknown charge of the skin still moves are excluded; `tau` (s) is the slowest time constant of
@@ -41,7 +43,7 @@ def make_friction_channel(
     if choice.unknown_charge:
         if "Vsc" in record and math.isfinite(b := estimate_from_vsc(record, choice, 1.0).b):
             tau = b
-        since = np.asarray(channel.time) - float(channel.time[0])
+        since = np.asarray(channel.samples.time) - float(channel.samples.time[0])
         excluded = since < 8.0 * tau  # after which 1 / 3000 of the charge is left
         if np.count_nonzero(~excluded[: len(record)]) < len(record) // 2:
             raise InputError(
@@ -49,4 +51,6 @@ def make_friction_channel(
                 " the first sample; record for twice as long"
             )
         channel = channel.exclude_samples(excluded)
-    return FrictionChannel.from_channel(certificate.fold(channel), as_arrays(scene.geometry()), constants)
+    channel, geometry = certificate.fold(channel), as_arrays(scene.geometry())
+    voltage = dataclasses.replace(channel.driven, channel=geometry.contact(template).channel)
+    return dataclasses.replace(channel, observable=FrictionObservable(voltage, geometry, constants))

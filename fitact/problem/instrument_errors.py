@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from fitact.likelihood.channel import ChannelLikelihood
-from fitact.likelihood.spectrum_channel import SpectrumChannel
+from fitact.likelihood.spectrum_observable import SpectrumObservable
 from fitact.model.drive import Sampled
 from fitact.prior.distributions import Distribution, LogNormal
 from fitact.prior.product import multiply
@@ -125,13 +125,14 @@ def _channel_errors(member: Member, kind: str) -> Iterable[tuple[str, Distributi
     """Yield the source and distribution of each error of a kind, and its powers in the channel and in V."""
     name, section, measurement = member.channel.channel, member.scene.instrument, member.scene.measurement
     is_nonlinear, in_V = kind.startswith("nonlinearity"), kind in V_NONLINEARITY
-    field, is_spectrum = "nonlinearity" if is_nonlinear else kind, isinstance(member.channel, SpectrumChannel)
+    field, observable = "nonlinearity" if is_nonlinear else kind, member.channel.observable
+    is_spectrum = isinstance(observable, SpectrumObservable)
     if is_nonlinear and is_spectrum:  # an analyser filters out the harmonics
         return
     impedance, signal = (("Z", 1.0), ("V", 1.0), ("I", -1.0)), ((name, 1.0), ("V", -1.0))
     friction = (("Ft", 1.0), ("V", 0.0))  # V acts through the square of the voltage
     for channel, power in {"impedance": impedance, "Ft": friction}.get(name, signal):
-        if (is_nonlinear and in_V != (channel == "V")) or (in_V and not isinstance(member.channel.drive, Sampled)):
+        if is_nonlinear and (in_V != (channel == "V") or (in_V and not isinstance(observable.driven.drive, Sampled))):
             continue
         for piece in section.pieces(channel):
             distribution = getattr(piece, field)

@@ -20,8 +20,9 @@ from fitact.compiled import pad_samples
 from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
 from fitact.errors import InputError
-from fitact.likelihood.channel import ChannelInputs, ChannelLikelihood
+from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.charge_rows import LAG, ROW_NOISE, ChargeRows, RowCovariance, step_means, whiten_rows
+from fitact.likelihood.observable import ChannelInputs
 from fitact.model.circuit import gain_at
 from fitact.model.drive import Sampled
 from fitact.problem.jumps import Jumps
@@ -42,9 +43,9 @@ class Current(NamedTuple):
 
         If a resistance limits the current, its capacitance is that whose rows have the same variance.
         """
-        terms, step = inputs.circuit.channel_terms(channel.channel), float(channel.time_step)
+        terms, step = inputs.circuit.channel_terms(channel.channel), float(channel.timing.step)
         stray = 0.0 if inputs.stray is None else float(inputs.stray)
-        delay = float(channel.shift) / step if delay is None else delay
+        delay = float(channel.timing.shift) / step if delay is None else delay
         if terms.rate is not None:
             return cls(float(terms.rate) + stray, float(np.sum(terms.weight)), delay)
         omega = math.pi / step * (np.arange(64) + 0.5) / 64.0
@@ -327,9 +328,10 @@ def solve_linear(
 
 def set_rows(channel: ChannelLikelihood, rows: ChargeRows, V: Rows, delay: float) -> ChannelLikelihood:
     """Return the channel with rows of charge, an estimate of the drive, and the delay (s) at which they are taken."""
-    length = np.shape(channel.time)[0]
+    length = np.shape(channel.samples.time)[0]
     padded = jax.tree.map(lambda x: np.pad(x, (0, length - x.size)), rows)
-    assert isinstance(channel.drive, Sampled)
-    drive = Sampled(channel.drive.time, pad_samples(V))
-    channel = channel.without_compression()
-    return dataclasses.replace(channel, drive=drive, charges=padded, shift=np.asarray(delay, dtype=float))
+    assert isinstance(channel.driven.drive, Sampled)
+    drive = Sampled(channel.driven.drive.time, pad_samples(V))
+    timing = dataclasses.replace(channel.timing, shift=np.asarray(delay, dtype=float))
+    channel = channel.without_compression().replace_samples(charges=padded)
+    return channel.replace_observable(drive=drive, timing=timing)

@@ -8,11 +8,13 @@ import numpy as np
 import scipy
 from jaxtyping import Complex, Float
 
-from fitact.compiled import as_arrays, jit, pad_samples
+from fitact.compiled import as_arrays, jit, pad_samples, pad_weight
 from fitact.data.spectrum import Spectrum
-from fitact.likelihood.channel import LINEAR_NUISANCES
+from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
-from fitact.likelihood.spectrum_channel import SpectrumChannel, join_complex
+from fitact.likelihood.observable import LINEAR_NUISANCES, DriveTiming
+from fitact.likelihood.padded_samples import PaddedSamples
+from fitact.likelihood.spectrum_observable import SpectrumObservable, join_complex
 from fitact.model.circuit import Channel
 from fitact.model.drive import Sine
 from fitact.problem.drive_choice import DriveModel
@@ -25,37 +27,33 @@ MIN_NOISE = 1e-6  # smallest relative noise; no analyser is better
 Points = Float[np.ndarray, " points"]
 
 
-def build_spectrum_channel(spectrum: Spectrum, scene: Scene, number: str) -> tuple[SpectrumChannel, Source]:
+def build_spectrum_channel(spectrum: Spectrum, scene: Scene, number: str) -> tuple[ChannelLikelihood, Source]:
     """Return the likelihood of a spectrum, and its source; `number` distinguishes it from other records."""
     choice, values, omega = _stated_drive(scene), spectrum.values, 2.0 * math.pi * spectrum.frequency
     parts = np.stack([values.real, values.imag], axis=-1).reshape(-1)
     noise = _scatter(np.log(np.abs(values)))
     skew = scene.skew_limit("Vsc", 0.0) if spectrum.channel == "Vsc" else 0.0
-    channel = SpectrumChannel(
-        time=pad_samples(np.arange(parts.size, dtype=float)),
-        observed=pad_samples(parts),
-        weight=None,
-        whitening=None,
-        noise_floor=np.asarray(MIN_NOISE),
-        rate=None,
-        drive=choice.drive,
+    # unit of a delay: 1 us
+    sd = np.array([skew / 1e-6 / math.sqrt(3.0), 1.0])
+    timing = DriveTiming(np.zeros(()), np.zeros(()), np.asarray(1e-6), sd, ("delay",) if skew > 0.0 else ())
+    kind, padded = cast(Channel, spectrum.channel), pad_samples(parts)
+    observable = SpectrumObservable(pad_samples(omega, 2 * omega.size)[: padded.size // 2], timing, kind)
+    channel = ChannelLikelihood(
+        samples=PaddedSamples(pad_samples(np.arange(parts.size, dtype=float)), padded, _weights(np.abs(values))),
+        observable=observable,
         linear_sd=np.zeros(len(LINEAR_NUISANCES)),
-        shift=np.zeros(()),
-        clock=np.zeros(()),
-        time_step=np.asarray(1e-6),  # unit of a delay, s
-        timing_sd=np.array([skew / 1e-6 / math.sqrt(3.0), 1.0]),
-        compression=None,
-        expansion=None,
-        label="_".join(filter(None, ("Z" if spectrum.channel == "impedance" else "H", number))),
-        channel=cast(Channel, spectrum.channel),
-        steady_state=True,
-        timing=("delay",) if skew > 0.0 else (),
+        noise_floor=np.asarray(MIN_NOISE),
+        label="_".join(filter(None, ("Z" if observable.is_impedance else "H", number))),
         noise="student" if scene.measurement.noise_model == "student" else "white",
         columns=(),
-        omega=pad_samples(omega, 2 * omega.size)[: pad_samples(parts).size // 2],
-    ).with_noise_sd(np.abs(values))
-    start = _estimate_skin(omega, values) if channel.is_impedance else _estimate_divider(omega, values)
+    )
+    start = _estimate_skin(omega, values) if observable.is_impedance else _estimate_divider(omega, values)
     return channel, Source(spectrum, scene, choice, noise, (), start, spectrum.notes, spectrum.warnings)
+
+
+def _weights(sd: Points) -> Float[np.ndarray, " samples"]:
+    """Return weights for noise in proportion to `sd`, in the unit of the response."""
+    return pad_weight(np.repeat(1.0 / sd, 2))
 
 
 def _stated_drive(scene: Scene) -> DriveModel:
@@ -111,20 +109,21 @@ def update_weights(
     """
     change = 0.0
     for i, (channel, source) in enumerate(zip(likelihood.channels, sources, strict=True)):
-        if isinstance(channel, SpectrumChannel):
+        if isinstance(channel.observable, SpectrumObservable):
             inputs = likelihood.make_inputs(likelihood.evaluate_circuit(theta).circuit, theta, channel)
-            n = channel.n_samples
-            signal, before = np.asarray(_signal(channel, inputs)), channel.weights[:n]
+            n = channel.samples.size
+            signal, before = np.asarray(_signal(channel, inputs)), channel.samples.weights[:n]
             taken_up = np.minimum(np.sum(influences[i][:n] ** 2, axis=1), 0.9)
-            remainder = (np.asarray(channel.observed) - signal)[:n] / np.sqrt(1.0 - taken_up)
+            remainder = (np.asarray(channel.samples.observed) - signal)[:n] / np.sqrt(1.0 - taken_up)
             model, residuals = join_complex(signal[:n]), join_complex(remainder)
-            channel = channel.with_noise_sd(_noise_sd(source.scene.measurement, np.abs(model), np.abs(residuals)))
-            change = max(change, float(np.max(np.abs(np.log(channel.weights[:n] / before)))))
+            sd = _noise_sd(source.scene.measurement, np.abs(model), np.abs(residuals))
+            channel = channel.replace_samples(weight=_weights(sd))
+            change = max(change, float(np.max(np.abs(np.log(channel.samples.weights[:n] / before)))))
             likelihood = likelihood.replace_channel(i, channel)
     return likelihood, change
 
 
-_signal = jit(SpectrumChannel.signal)
+_signal = jit(ChannelLikelihood.signal)
 
 
 def _noise_sd(measurement: Measurement, size: Points, residuals: Points) -> Points:

@@ -173,8 +173,8 @@ def _residual_objective(
     likelihood: Likelihood, theta: Float[np.ndarray, " circuit_parameters"]
 ) -> Float[np.ndarray, ""]:
     """Return half the sum over channels of samples times log(sum of squared residuals)."""
-    parts = [
-        channel.count * jnp.log(jnp.sum(jnp.square(channel.fit_nuisances(inputs, 1e-3 * jnp.ptp(channel.observed))[0])))
-        for channel, inputs in likelihood.channels_and_inputs(theta)
-    ]
-    return 0.5 * sum(parts, jnp.zeros(()))
+    total = jnp.zeros(())
+    for channel, inputs in likelihood.channels_and_inputs(theta):
+        residuals, *_ = channel.fit_nuisances(inputs, 1e-3 * jnp.ptp(channel.samples.observed))
+        total = total + 0.5 * channel.count * jnp.log(jnp.sum(jnp.square(residuals)))
+    return total

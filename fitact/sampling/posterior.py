@@ -25,7 +25,7 @@ from fitact.fitting.result import Fit
 from fitact.fitting.sensation import FeltDrive
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import draw_noise
-from fitact.likelihood.spectrum_channel import join_complex
+from fitact.likelihood.spectrum_observable import join_complex
 from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.model.drive import Periodic
 from fitact.sampling.chain import Chain
@@ -92,9 +92,8 @@ class Posterior(Display):
         draws |= {name: np.exp(self.points[..., size + i]) for i, name in enumerate(likelihood.sigma_names)}
         for channel, drawn in zip(likelihood.channels, np.moveaxis(self._linear_draws, -2, 0), strict=True):
             values = drawn * np.asarray(channel.linear_sd)
-            draws |= {
-                channel.qualified_name(channel.linear_names[column]): values[..., column] for column in channel.columns
-            }
+            names = channel.observable.linear_names
+            draws |= {channel.qualified_name(names[column]): values[..., column] for column in channel.columns}
         return draws | {name: np.exp(logs) for name, logs in self._geometry_logs.items()}
 
     def force(self) -> dict[str, Float[np.ndarray, "ensembles draws"]]:
@@ -433,11 +432,11 @@ class Posterior(Display):
             predicting = self.fit.likelihood, i, stride
             sd = channel.relative_noise_sd[::stride]
             chosen = self.points[:, draws], self._deviates[:, draws]
-            mean = derived.evaluate_draws(_predict_signal, predicting, model.time.size, *chosen)[..., : sd.size]
-            if model.charges is not None:  # whose signal has the derivative of the noise of V
+            mean = derived.evaluate_draws(_predict_signal, predicting, model.samples.time.size, *chosen)[..., : sd.size]
+            if model.samples.charges is not None:  # whose signal has the derivative of the noise of V
                 mean = mean - np.median(mean, axis=(0, 1)) + channel.prediction[::stride]
             sigma = np.exp(self.points[:, draws, self.fit.theta.size + i, None])
-            noise = draw_noise(rng, model.noise, model.whitening, mean.shape, stride)
+            noise = draw_noise(rng, model.noise, model.samples.whitening, mean.shape, stride)
             noisy = mean + sigma * sd * noise
             if isinstance(channel.record, Spectrum):
                 shape = "chain", "draw", *_spectrum_axis(channel)

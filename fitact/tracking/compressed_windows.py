@@ -117,7 +117,7 @@ class WindowModel(NamedTuple):
             weights = [np.where(each, 0.0, 1.0) if each.any() else None for each in clipped]
             lowest, highest = self._compare_signal(samples[0], self.compressor.expect(V, responses), weights[0])
             pairs = zip(channels, samples, strict=True)
-            recorded = [values if channel.charges is None else self._make_rows(window) for channel, values in pairs]
+            recorded = [values if each.samples.charges is None else self._make_rows(window) for each, values in pairs]
             if not is_in_contact(lowest, highest):
                 state = None
             is_clipped = any(each is not None for each in weights)
@@ -202,7 +202,7 @@ def find_model(windows: Sequence[Window], scene: Scene, step: float, source: str
 def _describe_current(fitted: Fit, record: Record, circuit: CircuitValues) -> tuple[RecordedCurrent, Current] | None:
     """Return the noise of a record's V and I, and what is modelled of I; None without I."""
     for channel in fitted.likelihood.channels:
-        if channel.charges is not None:
+        if channel.samples.charges is not None:
             inputs = fitted.likelihood.make_inputs(circuit.circuit, fitted.theta, channel)
             return RecordedCurrent.from_record(record), Current.from_channel(channel, inputs)
     return None

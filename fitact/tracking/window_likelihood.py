@@ -10,9 +10,9 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from fitact.compiled import jit, pad_rows
-from fitact.likelihood.channel import FIRST_CHARGE
 from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import Likelihood
+from fitact.likelihood.observable import FIRST_CHARGE
 from fitact.likelihood.window_compression import TrendInputs
 from fitact.model.circuit import FinalCircuit, HighpassTerms, charge_ratios
 from fitact.model.force import Geometry, force_constant

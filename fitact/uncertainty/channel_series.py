@@ -12,8 +12,8 @@ import scipy
 from jaxtyping import Bool, Complex, Float
 
 from fitact.data.record import is_uniform
-from fitact.likelihood.channel import CHARGES
 from fitact.likelihood.compression import HUM_FREQUENCIES
+from fitact.likelihood.observable import CHARGES
 
 Rows = Float[np.ndarray, " rows"]
 Spectrum = Complex[np.ndarray, " lines"]

@@ -55,7 +55,7 @@ def fit_two_skins(resistances: tuple[float, float], noise: float, starts: int = 
 
 def log_density(fit: fitact.Fit, log_R1: np.ndarray, log_R2: np.ndarray, log_sigma: float | None = None) -> np.ndarray:
     """Return the log-density by sums over the samples that are not excluded at an edge."""
-    used = fit.likelihood.channels[0].weights[: TIME.size] > 0.0
+    used = fit.likelihood.channels[0].samples.weights[: TIME.size] > 0.0
     assert used.sum() > TIME.size - 5
     signals, observed, sizes = SIGNALS[used], fit.record["I"][used], amplitudes(log_R1, log_R2)
     squares = observed @ observed - 2.0 * sizes @ (signals.T @ observed)

@@ -9,7 +9,7 @@ import pytest
 
 import fitact
 from fitact.experiment.blind_directions import blind_directions
-from fitact.likelihood.channel import CHARGES
+from fitact.likelihood.observable import CHARGES
 from fitact.model.circuit import gain_at
 from fitact.model.force import AirGap
 from fitact.units import quantity_unit
