@@ -9,7 +9,8 @@ export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS = 0
 # end where a flag is unknown, as the first is to them; there, the others are left out, too
 TEST_XLA_FLAGS = $(shell $(PY) -c 'from fitact.compiled import XLA_OPTIONS as o; print(("--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 --xla_llvm_disable_expensive_passes=true") * ("xla_cpu_use_fusion_emitters" in o))') \
   --xla_backend_optimization_level=0
-PYTEST = XLA_FLAGS="$(TEST_XLA_FLAGS)" $(PY) -m pytest -n auto
+# each worker has a core; threads of BLAS that wait for each other's cores took half of the tests' time
+PYTEST = XLA_FLAGS="$(TEST_XLA_FLAGS)" OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -n auto
 .DEFAULT_GOAL = help
 .PHONY: help env demo picture test test-slow test-slow-quick notebooks peers docs wheel extremes calibration calibration-quick session-calibration bench-calibration study-calibration fuzz check lock plotly axe clean
 

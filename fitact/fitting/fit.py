@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from fitact.blas import limit_to_one_thread
 from fitact.compiled import double_precision
 from fitact.data.kramers_kronig import check_kramers_kronig
 from fitact.data.record import Record
@@ -100,7 +101,7 @@ def fit_records(
         (scene or Scene()).require_available(fit=True)
     pairs = sorted(zip(records, scenes, strict=True), key=lambda pair: isinstance(pair[0], Spectrum))  # records first
     records, scenes = (tuple(each) for each in zip(*pairs, strict=True))
-    with double_precision():
+    with double_precision(), limit_to_one_thread():
         try:
             problem = build_problem(records, scenes, prior, drives)
             calibrated = calibrate(scenes[0], problem.likelihood.prior.names, fit_records)

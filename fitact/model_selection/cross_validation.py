@@ -16,6 +16,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float, Int
 
+from fitact.blas import limit_to_one_thread
 from fitact.compiled import double_precision, jit, pad_samples
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
@@ -60,7 +61,7 @@ def cross_validate(fit: Fit, folds: int = 10) -> CrossValidation:
     folds = min(folds, total)
     fold = np.random.default_rng(0).permutation(total) % folds
     log_density, failed = np.zeros(total), 0
-    with double_precision():
+    with double_precision(), limit_to_one_thread():
         likelihood = fit.likelihood.without_compression()
         sigma = np.array([trace.sigma for trace in fit.traces])
         for number in range(folds):

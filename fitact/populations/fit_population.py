@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from fitact.blas import limit_to_one_thread
 from fitact.compiled import BatchEvaluator, double_precision
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
@@ -118,7 +119,7 @@ def population(
         finger if within is None or finger.fingerprint in tracked else finger.blur(within.mean_covariance)
         for finger in fingers
     ]
-    with double_precision():
+    with double_precision(), limit_to_one_thread():
         hierarchy = Hierarchy.from_fingers(averages, nesting, medians, standardized.z_scores, area_varies=area_varies)
         chain_file = None if folder is None else Path(folder) / _CHAIN_FILE
         fingerprint = _fingerprint(averages, nesting, standardized, scene, seed)

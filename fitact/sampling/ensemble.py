@@ -19,6 +19,7 @@ import emcee
 import numpy as np
 from jaxtyping import Float
 
+from fitact.blas import limit_to_one_thread
 from fitact.compiled import double_precision
 from fitact.errors import InputError
 from fitact.files import remove_temporary
@@ -92,7 +93,7 @@ def sample(
             " least 2 ensembles"
         )
     start_time = time.perf_counter()
-    with double_precision():
+    with double_precision(), limit_to_one_thread():
         log_prob = reject_nonfinite(certificate.batched_log_prob(fit.likelihood, walkers))
         if level != "emcee":
             posterior = importance.draw_around_fit(fit, level, log_prob, seed)
