@@ -1,4 +1,4 @@
-"""What a channel observes: the signal of a circuit as a function of its parameters, and of delay and clock."""
+"""Observables of channels: the signal of a circuit as a function of its parameters, and of delay and clock."""
 
 import dataclasses
 import math
