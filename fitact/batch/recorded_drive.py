@@ -109,7 +109,7 @@ class RecordedDriveProblem(BatchProblem):
         fields = dict.fromkeys((field.name for field in dataclasses.fields(Compression)), 0.0)
         fields |= {"half_width": HALF_WIDTH, "samples": counted.size, "origin": origin, "time_step": shared.time_step}
         table = Compression(**{name: np.asarray(float(value)) for name, value in fields.items()})
-        trace = trace.shorten().replace_timing(shift=np.asarray(delay))
+        trace = trace.keep_ends().replace_timing(shift=np.asarray(delay))
         trace = dataclasses.replace(trace, columns=tuple(sorted(places)), compression=table)
         return cls(
             likelihood=likelihood.replace_channel(0, trace),

@@ -86,12 +86,12 @@ class ChannelFit:
         if samples.charges is not None:  # whose signal has the derivative of the noise of V
             steps = float(channel.timing.shift) / float(channel.timing.step)
             residuals = estimate_current_noise(samples.charges, np.asarray(white), steps)
-            of_steps = np.where(samples.counted, white, np.nan)[unpadded]
+            of_steps = np.where(samples.likelihood_mask, white, np.nan)[unpadded]
             of_steps = np.append(of_steps[LAG:], np.full(LAG, np.nan))
         residuals, weight = residuals[unpadded], None if samples.equally_weighted else samples.weights[unpadded]
         names = [channel.qualified_name(channel.observable.linear_names[column]) for column in channel.columns]
         linear = dict(zip(names, (beta * np.asarray(channel.linear_sd)[list(channel.columns)]).tolist(), strict=True))
-        counted = samples.counted[unpadded]
+        counted = samples.likelihood_mask[unpadded]
         white = white[unpadded][counted]
         n_fitted = theta.size * white.size / float(likelihood.count) + len(linear)
         if isinstance(source.record, Spectrum):
@@ -171,7 +171,7 @@ def _log_likelihood(
     """Return the log-likelihood at its maximum over the noise sd; under Student's t, at scale `sigma`."""
     samples = channel.samples
     if samples.charges is not None:
-        gain = np.asarray(samples.charges.gain)[samples.counted]
+        gain = np.asarray(samples.charges.gain)[samples.likelihood_mask]
         return gaussian_log_likelihood(white_residuals, None) + float(np.sum(np.log(gain)))
     if samples.whitening is None:
         weights = samples.weights[: residuals.size]
@@ -179,7 +179,7 @@ def _log_likelihood(
             return _student_log_likelihood(residuals, weights, sigma)
         return gaussian_log_likelihood(residuals, weights)
     innovations = white_residuals / float(samples.whitening.taps[0])
-    return gaussian_log_likelihood(innovations, None) + float(np.sum(np.log(samples.weights[samples.counted])))
+    return gaussian_log_likelihood(innovations, None) + float(np.sum(np.log(samples.weights[samples.likelihood_mask])))
 
 
 def gaussian_log_likelihood(residuals: Samples, weight: Samples | None) -> float:

@@ -90,7 +90,7 @@ def _channel_samples(
         rows |= {"time": zeros, "voltage": zeros, "frequency": None, "omega": 2.0 * math.pi * record.frequency}
     else:
         frequency = record.frequency() if choice.periodic else None
-        smooth = channel.driven.smooth  # noise of V hides a delay
+        smooth = channel.electrical.smooth  # noise of V hides a delay
         voltage = choice.voltage if smooth is None else np.asarray(smooth)[: len(record)]
         rows |= {"time": record.time, "voltage": voltage, "frequency": frequency}
     return ChannelSamples(

@@ -76,7 +76,7 @@ def _effect_functions(
         frequency = record.frequency() if settled else None
         functions["compensation"] = pad_samples(_highpass(signal, record.time, frequency, settled=settled))
     if not set(V_NONLINEARITY).isdisjoint(names):
-        shapes = nonlinearity_shapes(np.asarray(cast(Sampled, channel.driven.drive).samples))
+        shapes = nonlinearity_shapes(np.asarray(cast(Sampled, channel.electrical.drive).samples))
         rates = pad_samples(nonlinearity_slopes(record["V"])) if channel.samples.rate is not None else shapes
         functions |= zip(V_NONLINEARITY, _respond(channel, inputs, shapes, rates), strict=True)
     return np.stack([functions[name] for name in names])
@@ -92,7 +92,7 @@ def _respond(
     """Return the signal for each of these drives (V), whose dV/dt is `rates` times that of the channel's drive."""
     signals = []
     for voltage, rate in zip(voltages, rates, strict=True):
-        drive = dataclasses.replace(channel.driven.drive, samples=voltage)  # type: ignore[call-arg]
+        drive = dataclasses.replace(channel.electrical.drive, samples=voltage)  # type: ignore[call-arg]
         follows = channel.samples.rate is not None
         changed = channel.replace_observable(drive=drive).replace_samples(
             rate=rate * channel.samples.rate if follows else None

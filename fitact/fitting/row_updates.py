@@ -80,7 +80,7 @@ def _rows_at(
 
 def _with_drive(channel: ChannelLikelihood, current: RecordedCurrent, V: Rows) -> ChannelLikelihood:
     """Return the channel of a current that is 0, with another drive."""
-    charges, drive = channel.samples.charges, channel.driven.drive
+    charges, drive = channel.samples.charges, channel.electrical.drive
     assert charges is not None
     assert isinstance(drive, Sampled)
     length = np.shape(channel.samples.time)[0]

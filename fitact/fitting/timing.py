@@ -59,8 +59,8 @@ def free_timing(
     timing = channel.timing
     shift, clock = timing.shift + change["delay"], timing.clock + change["clock"]
     channel = channel.replace_timing(shift=shift, clock=clock)
-    if (steps := round(float(shift) / float(timing.step))) and channel.driven.smooth is not None:
-        delayed = channel.driven.delay_noise(steps, float(np.max(circuit.tau)))
+    if (steps := round(float(shift) / float(timing.step))) and channel.electrical.smooth is not None:
+        delayed = channel.electrical.delay_noise(steps, float(np.max(circuit.tau)))
         channel = recompress(dataclasses.replace(channel, observable=delayed), circuit)
     if not edges.any():
         return channel
@@ -70,10 +70,10 @@ def free_timing(
 
 def _edge_mask(channel: ChannelLikelihood, margin: float = 3.0) -> np.ndarray:
     """Return which samples lie within `margin` steps of an ideal edge and thus determine its time."""
-    if not has_ideal_edges(channel.driven.drive):
+    if not has_ideal_edges(channel.electrical.drive):
         return np.zeros(channel.samples.time.size, bool)
     time, step = np.asarray(channel.samples.time) - float(channel.timing.shift), margin * float(channel.timing.step)
-    return ideal_edge_mask(channel.driven.drive, time, step)
+    return ideal_edge_mask(channel.electrical.drive, time, step)
 
 
 def _residual_sums_of_squares(
@@ -163,7 +163,7 @@ def _clock_regressors(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: 
     taus = jnp.stack(constant_skin_circuit(inputs.circuit).channel_terms(channel.channel).tau)
 
     def response(log_tau: Array) -> Array:
-        return highpass(channel.driven.drive, time, jnp.exp(log_tau), steady_state=channel.driven.steady_state)
+        return highpass(channel.electrical.drive, time, jnp.exp(log_tau), steady_state=channel.electrical.steady_state)
 
     responses, tau_slopes = jax.vmap(lambda x: jax.jvp(response, (x,), (jnp.ones_like(x),)))(jnp.log(taus))
     signal = channel.signal(inputs)
@@ -173,7 +173,7 @@ def _clock_regressors(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: 
     # a free delay adds only the slope as a regressor
     delay = slope if "delay" in channel.timing.free else jnp.zeros_like(slope)
     rows = jnp.stack([time * slope, channel.samples.observed - signal, *responses, *tau_slopes, *shapes, delay])
-    rows = channel.samples.whiten(rows)
+    rows = channel.samples.apply_whitening(rows)
     if channel.noise != "student":
         return rows
     return rows * jnp.sqrt(student_weight(channel.fit_nuisances(inputs, sigma)[0] / sigma))

@@ -50,12 +50,12 @@ def compress_channel(
     reason = reason_against_table(channel, start, tolerance)
     if reason:
         return channel, reason
-    samples, driven = channel.samples, channel.driven
+    samples, electrical = channel.samples, channel.electrical
     part = slice(samples.size)
-    arrays = driven.drive, np.asarray(samples.time)[part], np.asarray(samples.observed)[part]
+    arrays = electrical.drive, np.asarray(samples.time)[part], np.asarray(samples.observed)[part]
     how: dict[str, Any] = {
         "student": student,
-        "steady_state": driven.steady_state,
+        "steady_state": electrical.steady_state,
         "weight": None if samples.equally_weighted else samples.weights[part],
         "whitening": samples.whitening and samples.whitening.restrict(part),
         "charges": samples.charges and samples.charges.restrict(part),
@@ -72,8 +72,8 @@ def compress_channel(
         fields = {field.name: getattr(compression, field.name) for field in dataclasses.fields(compression)}
         compression = GridCompression(**fields)
     else:
-        if driven.smooth is not None:
-            smooth = np.asarray(driven.smooth)[part]
+        if electrical.smooth is not None:
+            smooth = np.asarray(electrical.smooth)[part]
             how |= {"smooth": smooth, "slope": np.gradient(smooth, arrays[1])}
         compression = compress(*arrays, expected_terms=terms, delayed=_shifts_response(channel), **how)
     return dataclasses.replace(channel, compression=compression), ""
@@ -89,9 +89,9 @@ _signal = jit(ChannelLikelihood.signal)
 
 def fold(channel: ChannelLikelihood) -> ChannelLikelihood:
     """Return the channel with its `phases` if drive and samples repeat, where a response is costly."""
-    samples, driven = channel.samples, channel.driven
+    samples, electrical = channel.samples, channel.electrical
     time = np.asarray(samples.time)[: samples.size]
-    period = samples_per_period(driven.drive, time) if driven.steady_state and samples.rate is None else None
+    period = samples_per_period(electrical.drive, time) if electrical.steady_state and samples.rate is None else None
     if period is None:
         return channel
     return channel.replace_samples(phases=pad_samples(time[:period]), period=np.asarray(period))
@@ -211,7 +211,7 @@ def interpolate_channel(
     deviates = np.random.default_rng(0).standard_normal((training, theta.size))  # any reproducible points serve
     deviates *= np.random.default_rng(1).uniform(0.2, 1.0, (training, 1)) / np.linalg.norm(deviates, axis=1)[:, None]
     points = theta + np.vstack([np.zeros(theta.size), deviates * widths @ directions.T])
-    light = dataclasses.replace(likelihood, channels=tuple(each.shorten() for each in likelihood.channels))
+    light = dataclasses.replace(likelihood, channels=tuple(each.keep_ends() for each in likelihood.channels))
     inputs = _inputs(light, points)[index]
     compression = interpolate(channel, inputs, 0.3 * TOLERANCE * sigma)
     return dataclasses.replace(channel, compression=compression)

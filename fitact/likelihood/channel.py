@@ -28,7 +28,7 @@ from fitact.likelihood.noise import (
     student_residual,
     student_weight,
 )
-from fitact.likelihood.observable import LINEAR_NUISANCES, ChannelInputs, DrivenSignal, DriveTiming
+from fitact.likelihood.observable import LINEAR_NUISANCES, ChannelInputs, DriveTiming, ElectricalSignal
 from fitact.likelihood.padded_samples import PaddedSamples
 from fitact.likelihood.projection import MAX_DELAY, baseline_functions
 from fitact.likelihood.spectrum_observable import SpectrumObservable
@@ -40,7 +40,7 @@ class ChannelLikelihood(eqx.Module):
     """One channel of one record: its samples, what they observe, nuisances and noise."""
 
     samples: PaddedSamples
-    observable: DrivenSignal | SpectrumObservable | FrictionObservable
+    observable: ElectricalSignal | SpectrumObservable | FrictionObservable
     # prior standard deviations of the `LINEAR_NUISANCES`, in the channel's unit (drift: over half the record);
     # 0 excludes a nuisance
     linear_sd: Float[Array, " nuisances"]
@@ -70,9 +70,9 @@ class ChannelLikelihood(eqx.Module):
         return self.observable.timing
 
     @property
-    def driven(self) -> DrivenSignal:
+    def electrical(self) -> ElectricalSignal:
         """Vsc or I in time, of which the observable is made; TypeError for a spectrum."""
-        return self.observable.driven
+        return self.observable.electrical
 
     def qualified_name(self, name: str) -> str:
         """Return the name of a nuisance, followed by the channel's label if there are several channels."""
@@ -142,11 +142,11 @@ class ChannelLikelihood(eqx.Module):
 
         Code compiled for it then serves records of any length.
         """
-        return self if self.compression is None else self.shorten()
+        return self if self.compression is None else self.keep_ends()
 
-    def shorten(self) -> Self:
+    def keep_ends(self) -> Self:
         """Return the channel with only its first and last sample."""
-        return dataclasses.replace(self, samples=self.samples.shorten(), observable=self.observable.shorten())
+        return dataclasses.replace(self, samples=self.samples.keep_ends(), observable=self.observable.keep_ends())
 
     def select(self, part: Int[np.ndarray, " n"], weight: Float[np.ndarray, " n"]) -> Self:
         """Return the channel with only the samples `part`, with new weights and white noise."""
@@ -179,7 +179,7 @@ class ChannelLikelihood(eqx.Module):
             return samples.charges.whiten(remainder), samples.charges.whiten(shapes)
         if self.compression is None:
             remainder, shapes = samples.observed - self.signal(inputs), self.shapes(inputs)[self._column_indices]
-            return samples.whiten(remainder), samples.whiten(shapes)
+            return samples.apply_whitening(remainder), samples.apply_whitening(shapes)
         remainder = self.compression.observed - self._compressed_signal(inputs)[0]
         shapes = [self.compression.baseline]
         if isinstance(self.compression, Compression) and not isinstance(self.compression, GridCompression):
@@ -193,10 +193,10 @@ class ChannelLikelihood(eqx.Module):
         self, inputs: ChannelInputs
     ) -> tuple[Float[Array, " samples"], Float[Array, "columns samples"]]:
         """Return rows minus those of the signal, and the rows of the shapes of the `columns`, before whitening."""
-        charges, driven = self.samples.charges, self.driven
+        charges, electrical = self.samples.charges, self.electrical
         assert charges is not None
-        assert isinstance(driven.drive, Sampled)
-        total, rate = driven.response_and_rate(inputs, driven.drive.time)
+        assert isinstance(electrical.drive, Sampled)
+        total, rate = electrical.response_and_rate(inputs, electrical.drive.time)
         if inputs.effects is not None:
             total = total + inputs.effects @ self.samples.effects / inputs.gain
         functions = jnp.concatenate([total[None], self.shapes(inputs)[self._column_indices]])
@@ -216,7 +216,7 @@ class ChannelLikelihood(eqx.Module):
             signal = self.signal(inputs, dataclasses.replace(self.samples, phases=None, **at_points))
             timing = jnp.stack([jnp.asarray(inputs.delay), jnp.asarray(inputs.clock)])
             return compression.to_rows @ signal, compression.holds(signal, timing)
-        terms, delay = self.driven.terms(inputs), self.timing.shift + inputs.delay
+        terms, delay = self.electrical.terms(inputs), self.timing.shift + inputs.delay
         covered = compression.covers(jnp.stack(jnp.broadcast_arrays(*terms.tau)), delay)
         response = inputs.gain * compression.response(terms, delay)
         if self.samples.charges is not None:
@@ -232,14 +232,14 @@ class ChannelLikelihood(eqx.Module):
             return self.compression.observed
         if samples.charges is not None:
             return samples.charges.whiten(samples.charges.observed)
-        return samples.whiten(samples.observed)
+        return samples.apply_whitening(samples.observed)
 
     def whitened_delay_derivative(self, inputs: ChannelInputs) -> Float[Array, " rows"]:
         """Return the whitened derivative of the signal with respect to a delay, over samples or coordinates."""
         if self.samples.charges is not None:  # whose delay is no optional nuisance
             return jnp.zeros(self.rows)
         if self.compression is None:
-            return self.samples.whiten(self.observable.delay_derivative(self.samples, inputs))
+            return self.samples.apply_whitening(self.observable.delay_derivative(self.samples, inputs))
         if isinstance(self.compression, Interpolation | GridCompression):
             return self.compression.slope
         return inputs.gain * self.compression.delay_derivative(inputs.circuit.channel_terms(self.channel))

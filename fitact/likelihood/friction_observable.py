@@ -8,7 +8,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from fitact.likelihood.compression import BASELINE_NAMES
-from fitact.likelihood.observable import ChannelInputs, DrivenSignal, DriveTiming, Observable
+from fitact.likelihood.observable import ChannelInputs, DriveTiming, ElectricalSignal, Observable
 from fitact.likelihood.padded_samples import PaddedSamples
 from fitact.model.circuit import Channel
 from fitact.model.force import Geometry, electrostatic_force, friction
@@ -22,7 +22,7 @@ _NUISANCES = ("ringing", "ringing_2", "crosstalk", "crosstalk_2")
 class FrictionObservable(Observable):
     """Tangential force  mu (force_scale * electrostatic force + fN), eq. (2), through the dynamics of a sensor."""
 
-    voltage: DrivenSignal  # that generates the force
+    voltage: ElectricalSignal  # that generates the force
     geometry: Geometry
     constants: dict[str, ArrayLike]  # values of `FRICTION_PARAMETERS`; a free one is replaced
 
@@ -35,7 +35,7 @@ class FrictionObservable(Observable):
         return self.voltage.timing
 
     @property
-    def driven(self) -> DrivenSignal:
+    def electrical(self) -> ElectricalSignal:
         return self.voltage
 
     @property
@@ -46,8 +46,8 @@ class FrictionObservable(Observable):
     def follows_samples(self) -> bool:
         return self.voltage.follows_samples
 
-    def shorten(self) -> Self:
-        return dataclasses.replace(self, voltage=self.voltage.shorten())
+    def keep_ends(self) -> Self:
+        return dataclasses.replace(self, voltage=self.voltage.keep_ends())
 
     def _values(self, inputs: ChannelInputs) -> dict[str, ArrayLike]:
         return self.constants | (inputs.friction or {})

@@ -123,7 +123,7 @@ def _passes_corner(channel: ChannelLikelihood, lowest: np.ndarray, highest: np.n
 @jit
 def _pieces(channel: ChannelLikelihood, delays: Array, clocks: Array) -> Float[Array, "n samples"]:
     """Return numbers of the pieces of the drive on which the samples lie."""
-    drive = channel.driven.drive
+    drive = channel.electrical.drive
     wave = drive.wave if isinstance(drive, Burst) else drive
 
     def piece(delay: Array, clock: Array) -> Array:
@@ -186,7 +186,7 @@ def _accumulate(
     ends = samples.time[0], samples.time[-1]
     filtering = WhiteningState.start(taps, len(combinations) + len(BASELINE_NAMES) + 2)
     for chunk in chunks(samples, chunk_length(samples.time.size)):
-        total, filtering = _chunk_products(channel.shorten(), training, combinations, chunk, ends, filtering)
+        total, filtering = _chunk_products(channel.keep_ends(), training, combinations, chunk, ends, filtering)
         yield total
 
 

@@ -67,12 +67,12 @@ class Observable(eqx.Module):
         return False
 
     @property
-    def driven(self) -> "DrivenSignal":
+    def electrical(self) -> "ElectricalSignal":
         """Vsc or I in time, of which it is made; TypeError for a spectrum."""
         raise TypeError(f"{type(self).__name__} is not in time")
 
-    def shorten(self) -> Self:
-        """Return what `PaddedSamples.shorten` needs."""
+    def keep_ends(self) -> Self:
+        """Return what `PaddedSamples.keep_ends` needs."""
         return self
 
     def response(
@@ -93,7 +93,7 @@ class Observable(eqx.Module):
         return jnp.zeros_like(samples.observed)
 
 
-class DrivenSignal(Observable):
+class ElectricalSignal(Observable):
     """Vsc or I in time, beside a drive."""
 
     drive: Drive  # V(t)
@@ -103,7 +103,7 @@ class DrivenSignal(Observable):
     smooth: Float[Array, " samples"] | None = None  # recorded drive as a delay shifts it (`smooth_drive`), V
 
     @property
-    def driven(self) -> "DrivenSignal":
+    def electrical(self) -> "ElectricalSignal":
         return self
 
     @property
@@ -111,7 +111,7 @@ class DrivenSignal(Observable):
         """Whether the response follows a measured drive from sample to sample."""
         return isinstance(self.drive, Sampled) and not self.steady_state
 
-    def shorten(self) -> Self:
+    def keep_ends(self) -> Self:
         """Return the first two samples of a measured drive."""
         drive, smooth = self.drive, None if self.smooth is None else np.zeros(2)
         if isinstance(drive, Sampled):

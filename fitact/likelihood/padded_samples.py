@@ -48,7 +48,7 @@ class PaddedSamples(eqx.Module):
         return self.weight is None or bool(np.all(self.weights[: self.size] == 1.0))
 
     @property
-    def counted(self) -> Bool[np.ndarray, " samples"]:
+    def likelihood_mask(self) -> Bool[np.ndarray, " samples"]:
         """Mask of the samples, or rows, that enter the likelihood."""
         if self.charges is not None:
             return np.asarray(self.charges.used) > 0.0
@@ -68,7 +68,7 @@ class PaddedSamples(eqx.Module):
         """Middle of the record, and half its length, s."""
         return 0.5 * (self.time[0] + self.time[-1]), 0.5 * (self.time[-1] - self.time[0])
 
-    def whiten(self, values: Float[Array, "*shape samples"]) -> Float[Array, "*shape samples"]:
+    def apply_whitening(self, values: Float[Array, "*shape samples"]) -> Float[Array, "*shape samples"]:
         """Return values over the samples in units of independent noise of equal sd; 0 for excluded samples."""
         values = values if self.weight is None else values * self.weight
         return values if self.whitening is None else self.whitening(values)
@@ -83,10 +83,7 @@ class PaddedSamples(eqx.Module):
 
     def select(self, part: Int[np.ndarray, " n"], weight: Float[np.ndarray, " n"]) -> "PaddedSamples":
         """Return only the samples `part`, with new weights and white noise."""
-        kept: dict[str, Any] = {
-            name: None if values is None else pad_samples(np.asarray(values)[..., part])
-            for name, values in self._functions().items()
-        }
+        kept = jax.tree.map(lambda values: pad_samples(np.asarray(values)[..., part]), self._functions)
         return dataclasses.replace(self, **kept, weight=pad_weight(weight), whitening=None, phases=None)
 
     def thin(self, count: int) -> "PaddedSamples":
@@ -99,18 +96,16 @@ class PaddedSamples(eqx.Module):
         part = np.unique(np.concatenate([[0, self.size - 1], counted]))
         return self.select(part, weight[part])
 
-    def shorten(self) -> "PaddedSamples":
+    def keep_ends(self) -> "PaddedSamples":
         """Return only the first and the last time, with the least and the largest value."""
         # by NumPy, since JAX would compile this for every length
-        kept: dict[str, Any] = {
-            name: None if values is None else np.zeros((*values.shape[:-1], 2))
-            for name, values in self._functions().items()
-        }
+        kept = jax.tree.map(lambda values: np.zeros((*values.shape[:-1], 2)), self._functions)
         observed = np.asarray(self.observed)
         kept |= {"time": np.asarray(self.time)[[0, -1]], "observed": np.array([observed.min(), observed.max()])}
         charges = None if self.charges is None else jax.tree.map(lambda _: np.zeros(2), self.charges)
         return dataclasses.replace(self, **kept, charges=charges, weight=None, whitening=None, phases=None)
 
-    def _functions(self) -> dict[str, Array | None]:
-        """Return the fields that have a value at each sample, but for what follows from weights and rows."""
+    @property
+    def _functions(self) -> dict[str, Any]:
+        """Fields that have a value at each sample, but for weights and rows."""
         return {name: getattr(self, name) for name in ("time", "observed", "rate", "effects")}

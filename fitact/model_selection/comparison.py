@@ -202,7 +202,7 @@ def _require_same_samples(fits: Mapping[str, Fit]) -> None:
     for name, other in others:
         channels = zip(reference.likelihood.channels, other.likelihood.channels, strict=True)
         for trace, pair in zip(reference.traces, channels, strict=True):
-            differ = np.count_nonzero(np.not_equal(*(each.samples.counted for each in pair)))
+            differ = np.count_nonzero(np.not_equal(*(each.samples.likelihood_mask for each in pair)))
             if differ:
                 raise InputError(
                     f"{first} and {name} do not use the same samples of {trace.channel}: {differ} enter only"

@@ -116,7 +116,7 @@ class _LinearisedModel(NamedTuple):
             by_nuisances[:, ends[i] : ends[i + 1]] = -np.asarray(shapes[i]).T
             slope = np.hstack([np.asarray(slopes[i]) @ full.prior_factor, by_nuisances]) / sigma[i]
             samples, is_student = trace.samples, trace.noise == "student"
-            counts = samples.counted
+            counts = samples.likelihood_mask
             first = 1.0 if samples.whitening is None else abs(float(samples.whitening.taps[0]))
             scale = samples.weights * first if samples.charges is None else np.asarray(samples.charges.gain)
             with np.errstate(divide="ignore"):

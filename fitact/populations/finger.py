@@ -163,7 +163,7 @@ def _flatten_skin_prior(likelihood: Likelihood, log_sd: float = 1e3) -> Likeliho
     prior = likelihood.prior
     flat = {name: LogNormal(math.exp(prior[name].log_mean), log_sd) for name in FINGER_PARAMETERS}
     marginals = dict(zip(prior.names, prior.marginals, strict=True)) | flat
-    return dataclasses.replace(likelihood, prior=Prior.of(**marginals))
+    return dataclasses.replace(likelihood, prior=Prior.from_marginals(**marginals))
 
 
 @jit

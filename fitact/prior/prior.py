@@ -18,7 +18,7 @@ from fitact.prior.distributions import Distribution
 
 
 class Prior(eqx.Module):
-    """Joint prior of named parameters, independent or correlated; construct it by `Prior.of(Rsc=..., Csc=..., Ci=...)`.
+    """Joint prior of named parameters, independent or correlated, as `Prior.from_marginals(Rsc=..., Csc=...)` makes it.
 
     Correlations apply to the standard normal z of each parameter (a Gaussian copula), so they do not change the
     marginals. If all marginals are log-normal, the logarithms are multivariate normal with these correlations.
@@ -65,7 +65,7 @@ class Prior(eqx.Module):
             )
 
     @classmethod
-    def of(
+    def from_marginals(
         cls,
         correlation: Mapping[tuple[str, str], float] | None = None,
         order_constraints: tuple[tuple[str, str], ...] = (),

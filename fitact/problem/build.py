@@ -23,7 +23,7 @@ from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.compression import HUM_FREQUENCIES
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import Autoregression, estimate_quiet_noise, require_uniform
-from fitact.likelihood.observable import CHARGES, FIRST_CHARGE, LINEAR_NUISANCES, DrivenSignal, DriveTiming
+from fitact.likelihood.observable import CHARGES, FIRST_CHARGE, LINEAR_NUISANCES, DriveTiming, ElectricalSignal
 from fitact.likelihood.padded_samples import PaddedSamples
 from fitact.likelihood.smooth_drive import smooth_drive
 from fitact.model.circuit import Channel, Circuit, FinalCircuit, passes_direct_current
@@ -264,7 +264,7 @@ def _build_channel(
             whitening=colour and colour.whitening(np.ones(len(record), bool) if weight is None else weight > 0.0),
             rate=None if begun.slope is None else pad_samples(begun.slope),
         ),
-        observable=DrivenSignal(choice.drive, timing, channel, choice.steady_state, smooth),
+        observable=ElectricalSignal(choice.drive, timing, channel, choice.steady_state, smooth),
         linear_sd=linear_sd,
         noise_floor=noise_floor,
         label=label,

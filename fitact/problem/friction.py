@@ -52,5 +52,5 @@ def make_friction_channel(
             )
         channel = channel.exclude_samples(excluded)
     channel, geometry = certificate.fold(channel), as_arrays(scene.geometry())
-    voltage = dataclasses.replace(channel.driven, channel=geometry.contact(template).channel)
+    voltage = dataclasses.replace(channel.electrical, channel=geometry.contact(template).channel)
     return dataclasses.replace(channel, observable=FrictionObservable(voltage, geometry, constants))

@@ -132,7 +132,9 @@ def _channel_errors(member: Member, kind: str) -> Iterable[tuple[str, Distributi
     impedance, signal = (("Z", 1.0), ("V", 1.0), ("I", -1.0)), ((name, 1.0), ("V", -1.0))
     friction = (("Ft", 1.0), ("V", 0.0))  # V acts through the square of the voltage
     for channel, power in {"impedance": impedance, "Ft": friction}.get(name, signal):
-        if is_nonlinear and (in_V != (channel == "V") or (in_V and not isinstance(observable.driven.drive, Sampled))):
+        if is_nonlinear and in_V != (channel == "V"):
+            continue
+        if in_V and not isinstance(observable.electrical.drive, Sampled):
             continue
         for piece in section.pieces(channel):
             distribution = getattr(piece, field)

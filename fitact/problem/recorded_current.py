@@ -330,8 +330,8 @@ def set_rows(channel: ChannelLikelihood, rows: ChargeRows, V: Rows, delay: float
     """Return the channel with rows of charge, an estimate of the drive, and the delay (s) at which they are taken."""
     length = np.shape(channel.samples.time)[0]
     padded = jax.tree.map(lambda x: np.pad(x, (0, length - x.size)), rows)
-    assert isinstance(channel.driven.drive, Sampled)
-    drive = Sampled(channel.driven.drive.time, pad_samples(V))
+    assert isinstance(channel.electrical.drive, Sampled)
+    drive = Sampled(channel.electrical.drive.time, pad_samples(V))
     timing = dataclasses.replace(channel.timing, shift=np.asarray(delay, dtype=float))
     channel = channel.without_compression().replace_samples(charges=padded)
     return channel.replace_observable(drive=drive, timing=timing)

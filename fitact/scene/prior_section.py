@@ -80,7 +80,7 @@ class PriorSection(Section):
                 if other is not None:
                     self._check_pair(name, key, other)
         free = [name for name, belief in beliefs.items() if belief.is_free]
-        Prior.of(self.correlations(), self.order_constraints(), **dict.fromkeys(free, LogNormal(1.0, 1.0)))
+        Prior.from_marginals(self.correlations(), self.order_constraints(), **dict.fromkeys(free, LogNormal(1.0, 1.0)))
         return self
 
     def _check_pair(self, name: str, key: str, other: str) -> None:

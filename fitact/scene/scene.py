@@ -359,7 +359,7 @@ class Scene(Section, Display):
                     " {median, relative_sd} or {median, factor}, and one of a thickness or permittivity, too"
                 )
             correlations = {("Csc", "Ci"): correlation} | correlations
-        return Prior.of(correlations, self.prior.order_constraints(), **marginals)
+        return Prior.from_marginals(correlations, self.prior.order_constraints(), **marginals)
 
     def fixed_values(self) -> dict[str, float]:
         """Return the fixed parameters and their values, SI.

@@ -55,7 +55,7 @@ def test_what_lies_within_the_noise_has_none():
 @pytest.mark.parametrize(("distance", "is_warned"), [(2.9, False), (3.1, True), (-3.1, True)])
 def test_data_far_from_the_prior_of_a_part(distance: float, is_warned: bool):
     """The pull of a parameter that the data determine is its distance over the prior's standard deviation."""
-    prior = fitact.Prior.of(
+    prior = fitact.Prior.from_marginals(
         Rsc=fitact.LogNormal(1e5, 10.0), Ri=fitact.LogNormal(5e6, 4.0), force_scale=fitact.LogNormal(1.0, 2.0)
     )
     sd = float(prior["Ri"].log_sd)

@@ -43,7 +43,7 @@ def test_a_clock_is_found(waveform: str, off: float, periods: int, per_period: i
     fit = fitted(waveform, off, periods, per_period)
     assert fit.result == "successful"
     clock = fit.parameters()["clock"]
-    frequency = float(fit.likelihood.channels[0].driven.drive.frequency) * (1.0 + clock["q50"])
+    frequency = float(fit.likelihood.channels[0].electrical.drive.frequency) * (1.0 + clock["q50"])
     assert abs(frequency / 100.0 - 1.0 - off) < 4.0 * clock["sd"]
     for name, truth in (("g", G), ("b", B)):
         assert abs(fit.derived()[name]["q50"] - truth) < 4.0 * fit.derived()[name]["sd"]

@@ -400,7 +400,7 @@ def test_a_body_at_earth():
 
 
 def test_draws_are_spread_evenly_over_the_prior():
-    prior = fitact.Prior.of(Rsc=fitact.LogNormal(1e5, 0.5), Csc=fitact.Uniform(1e-9, 3e-9))
+    prior = fitact.Prior.from_marginals(Rsc=fitact.LogNormal(1e5, 0.5), Csc=fitact.Uniform(1e-9, 3e-9))
     drawn = prior.sample_qmc(500)
     shares = scipy.stats.norm.cdf(np.log(drawn["Rsc"] / 1e5) / 0.5), (drawn["Csc"] - 1e-9) / 2e-9
     # independent draws give 0.03, a lattice in two dimensions 0.02

@@ -39,7 +39,7 @@ from tests.population_calibration import FREQUENCY, simulate, steady, vsc, wave
 NUTS_CHAINS, NUTS_STEPS = 4, 3000
 FINGERS = Path(__file__).parents[2] / "data_synth" / "records" / "fingers"
 SCALES = {"Rsc": (11.8, 0.4), "Csc": (-17.7, 0.5), "Ci": (-20.4, 0.1)}  # of logarithms: mean, standard deviation
-PRIOR = Prior.of(**{name: fitact.LogNormal(float(np.exp(mean)), sd) for name, (mean, sd) in SCALES.items()})
+PRIOR = Prior.from_marginals(**{name: fitact.LogNormal(float(np.exp(mean)), sd) for name, (mean, sd) in SCALES.items()})
 
 
 def finger_that_says(center: np.ndarray, factor: np.ndarray, target: np.ndarray, source: str = "") -> Finger:

@@ -110,7 +110,7 @@ def test_gradients_are_finite_inside_and_density_is_zero_outside(name: str):
         lambda: fitact.LogNormal.within_factor(1.0, 0.5),
         lambda: fitact.TruncatedLogNormal(1.0, 0.1, 2.0, 1.0),
         lambda: fitact.TruncatedLogNormal(1.0, 0.1, 5.0, 10.0),
-        lambda: fitact.Prior.of({("Rsc", "Ci"): 0.5}, Rsc=fitact.LogNormal(1.0, 1.0)),
+        lambda: fitact.Prior.from_marginals({("Rsc", "Ci"): 0.5}, Rsc=fitact.LogNormal(1.0, 1.0)),
         lambda: three({("Rsc", "Csc"): 1.0}),
         lambda: three({("Rsc", "Csc"): math.nan}),
         lambda: three({("Rsc", "Csc"): 0.9, ("Csc", "Ci"): 0.9, ("Rsc", "Ci"): -0.9}),
@@ -124,7 +124,7 @@ def test_nonsense_is_refused(bad):
 def three(correlation: dict, uniform: bool = False) -> fitact.Prior:
     box = fitact.Uniform(8.85e-9, 44.25e-9)
     log_normal = fitact.LogNormal(22e-9, 0.7)
-    return fitact.Prior.of(
+    return fitact.Prior.from_marginals(
         correlation,
         Rsc=fitact.LogNormal.within_factor(130e3, 3.0),
         Csc=box if uniform else log_normal,
@@ -161,7 +161,7 @@ def test_copula_keeps_the_marginals_and_has_the_covariance_it_states():
 
 
 def test_copula_density_integrates_to_one_and_is_differentiable():
-    box = fitact.Prior.of({("x", "y"): -0.6}, x=fitact.Uniform(1.0, 5.0), y=fitact.LogNormal(1.0, 0.5))
+    box = fitact.Prior.from_marginals({("x", "y"): -0.6}, x=fitact.Uniform(1.0, 5.0), y=fitact.LogNormal(1.0, 0.5))
     nodes, weights = np.polynomial.legendre.leggauss(200)
     x, y = 0.5 * math.log(5.0) * (nodes + 1.0), 4.0 * nodes
     points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
@@ -182,15 +182,19 @@ def test_replacing_a_marginal_keeps_the_correlations():
 
 def test_order_is_a_factor_of_0_or_1():
     """Either of two equal marginals is the lower with probability 1/2, so the accepted draws are order statistics."""
-    alone = fitact.Prior.of(low=fitact.Uniform(1.0, 2.0), high=fitact.Uniform(1.0, 2.0))
-    prior = fitact.Prior.of(None, (("low", "high"),), low=fitact.Uniform(1.0, 2.0), high=fitact.Uniform(1.0, 2.0))
+    alone = fitact.Prior.from_marginals(low=fitact.Uniform(1.0, 2.0), high=fitact.Uniform(1.0, 2.0))
+    prior = fitact.Prior.from_marginals(
+        None, (("low", "high"),), low=fitact.Uniform(1.0, 2.0), high=fitact.Uniform(1.0, 2.0)
+    )
     u = np.log([1.2, 1.3])
     assert float(prior.log_density(u)) == float(alone.log_density(u))
     assert float(prior.log_density(u[::-1])) == -np.inf
     drawn = prior.sample(np.random.default_rng(1), 20_000)
     assert np.all(drawn["low"] < drawn["high"])
     assert scipy.stats.kstest(drawn["high"] - 1.0, scipy.stats.beta(2, 1).cdf).pvalue > 1e-4
-    impossible = fitact.Prior.of(None, (("a", "b"),), a=fitact.Uniform(3.0, 4.0), b=fitact.Uniform(1.0, 2.0))
+    impossible = fitact.Prior.from_marginals(
+        None, (("a", "b"),), a=fitact.Uniform(3.0, 4.0), b=fitact.Uniform(1.0, 2.0)
+    )
     with pytest.raises(fitact.InputError, match="a < b"):
         impossible.sample(np.random.default_rng(1), 100)
 
