@@ -376,9 +376,9 @@ def _can_smooth(choice: DriveModel, template: Circuit) -> bool:
 
 
 def _smooth_drive(record: Record) -> Float[np.ndarray, " samples"] | None:
-    """Return V as a delay shifts it; None if it has no noise, or is rounded to steps above its noise."""
-    noise = white_noise_sd(record["V"])
-    if noise == 0.0 or rounding_noise_sd(record["V"]) > 0.0:
+    """Return V as a delay shifts it; None if it has no noise, or less than half of its rounding's beside it."""
+    noise, rounding = white_noise_sd(record["V"]), rounding_noise_sd(record["V"])
+    if noise == 0.0 or math.hypot(rounding, 0.5 * rounding) > noise:
         return None
     return pad_samples(smooth_drive(record["V"], noise))
 

@@ -71,6 +71,18 @@ def test_a_delay_is_not_drawn_between_two_samples(skew: int, noise_V: float):
         assert abs(np.mean(each)) < 3.5 / np.sqrt(len(each)), name
 
 
+@pytest.mark.parametrize(("bits", "noise_V"), [(12, 0.1), (12, 0.03), (14, 0.03)])
+def test_a_delay_that_nobody_stated_is_found_in_a_rounded_drive(bits: int, noise_V: float):
+    """Half a step: not found while V was not smooth where it is rounded to its noise, b was off by 24 to 27 u."""
+    scene = fitact.Scene.from_dict({"drive": {"waveform": "measured"}, "prior": {"Ci": {"relative_sd": 0.1}}})
+    b = SKIN[0] * (2.0 * SKIN[2] + SKIN[1])
+    for seed in range(3):
+        fit = fitact.fit(record(seed, 4, noise_V, bits=bits), scene)
+        found, delay = fit.derived()["b"], fit.parameters()["delay"]
+        assert abs(np.log(found["q50"] / b)) < 3.5 * found["sd"] / found["mean"]
+        assert abs(delay["q50"] - 0.5 * STEP) < 3.5 * delay["sd"]
+
+
 def test_the_table_and_the_full_sum_shift_alike():
     made = record(1, 11, 0.1)  # more than a step, by which the noise of V is moved, too
     compressed, full = fitact.fit(made, SCENE), fitact.fit(made, SCENE, tolerance=0.0)
