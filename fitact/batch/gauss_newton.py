@@ -6,8 +6,6 @@ as long (68 us per record against 7.5 us), and that without the noise and the nu
 
 import dataclasses
 import functools
-import itertools
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -20,13 +18,14 @@ from jaxtyping import Array, Bool, Float
 
 from fitact.compiled import jit, map_blocks
 from fitact.fitting.least_squares import NUISANCES
+from fitact.fitting.score_test import explained_squares, orthonormalise
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import Likelihood
-from fitact.likelihood.observable import ChannelInputs
+from fitact.likelihood.observable import TIMING_NUISANCES, ChannelInputs
 
-CANDIDATES = (*NUISANCES, "delay", "clock")  # nuisances that a record may need
-_TOLERANCE = 1e-9  # fraction of a column within rounding, if that is all that remains beside others
+_SHAPES = {name: places for name, places in NUISANCES.items() if name != "crosstalk"}  # batches have no friction
+CANDIDATES = (*_SHAPES, *TIMING_NUISANCES)  # nuisances that a record may need
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,38 +182,19 @@ def _r_squared(
     """
     table = channel.compression
     assert isinstance(table, Compression)
-    places = list(itertools.chain(*NUISANCES.values()))
-    candidates = jnp.stack([*(table.baseline[i] for i in places), channel.whitened_delay_derivative(inputs), clock])
+    candidates = {name: table.baseline[np.array(places)] for name, places in _SHAPES.items()}
+    candidates |= {"delay": channel.whitened_delay_derivative(inputs)[None], "clock": clock[None]}
     shapes = channel.residuals_and_shapes(inputs)[1] * (channel.linear_sd[np.array(channel.columns, int), None] > 0.0)
-    off_prior = residuals.size - channel.rows
-    candidates, shapes = (jnp.pad(each, ((0, 0), (0, off_prior))) for each in (candidates, shapes))
-    columns = [*jacobian.T, *shapes]
-    fitted = jnp.stack(_orthonormalise(columns, [_TOLERANCE * jnp.linalg.norm(column) for column in columns]))
-    rest, min_lengths = candidates, _TOLERANCE * jnp.linalg.norm(candidates, axis=1)
-    for _ in range(2):
-        rest = rest - (rest @ fitted.T) @ fitted
-    starts = np.cumsum([0, *map(len, NUISANCES.values()), 1, 1])
-    groups = [slice(*ends) for ends in itertools.pairwise(starts.tolist())]
-    bases = [_orthonormalise(list(rest[group]), list(min_lengths[group])) for group in groups]
-    explained = [sum(jnp.square(q @ residuals) for q in basis) for basis in bases]
-    return jnp.stack(explained) / jnp.sum(jnp.square(residuals[: channel.rows]))
-
-
-def _orthonormalise(columns: list[Array], min_lengths: Sequence[ArrayLike]) -> list[Array]:
-    """Make columns orthonormal by Gram-Schmidt, applied twice; a column becomes 0 if only its `min_lengths` remains."""
-    basis = jnp.zeros((0, columns[0].size))
-    for column, min_length in zip(columns, min_lengths, strict=True):
-        rest = column
-        for _ in range(2):
-            rest = rest - jnp.sum(jnp.sum(basis * rest, axis=1, keepdims=True) * basis, axis=0)
-        length = jnp.linalg.norm(rest)
-        basis = jnp.vstack([basis, jnp.where(length > min_length, rest / length, 0.0)])
-    return list(basis)
+    around = (0, 0), (0, residuals.size - channel.rows)
+    fitted = jnp.concatenate([jacobian.T, jnp.pad(shapes, around)])
+    candidates = {name: jnp.pad(rows, around) for name, rows in candidates.items()}
+    explained = explained_squares(residuals, fitted, candidates)
+    return jnp.stack([explained[name] for name in CANDIDATES]) / jnp.sum(jnp.square(residuals[: channel.rows]))
 
 
 def decompose_qr(jacobian: Float[Array, "rows n"], residuals: Array) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
-    """Return R and Q^T residuals of a QR decomposition; it vectorises over many small matrices, unlike LAPACK."""
-    q = jnp.stack(_orthonormalise(list(jacobian.T), [0.0] * jacobian.shape[1]))
+    """Return R and Q^T residuals of a QR decomposition."""
+    q = orthonormalise(jacobian.T, tolerance=0.0)
     return jnp.triu(q @ jacobian), q @ residuals
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fitact.batch.batch_problem import SAMPLE_BLOCK, BatchFit, BatchProblem, Screening, stack_channel
-from fitact.batch.gauss_newton import GaussNewton, GaussNewtonResult, RecordInputs, find_optima
+from fitact.batch.gauss_newton import CANDIDATES, GaussNewton, GaussNewtonResult, RecordInputs, find_optima
 from fitact.batch.recorded_tables import (
     AGES,
     HALF_WIDTH,
@@ -217,9 +217,10 @@ class RecordedDriveProblem(BatchProblem):
             optima = find_optima(self.likelihood, self.settings, clock, np.asarray(tolerance), inputs, start, noise)
             gains, linear_sd = self.bic_decreases(optima.r_squared), linear_sd.copy()
             largest = np.max(gains, axis=1)
-            for name, gain in zip(NUISANCES, gains.T, strict=False):  # delays and clocks, which follow, are not added
+            for name, gain in zip(CANDIDATES, gains.T, strict=True):
                 rows = np.flatnonzero((gain == largest) & (largest > MIN_BIC_DECREASE))
-                linear_sd[np.ix_(rows, np.array(NUISANCES[name]))] = wide[rows, None]
+                if name in NUISANCES:  # delays and clocks are not added
+                    linear_sd[np.ix_(rows, np.array(NUISANCES[name]))] = wide[rows, None]
             if np.array_equal(linear_sd, inputs.linear_sd) and tolerance == self.settings.loop_tolerance:
                 return inputs, optima
             start, noise = optima.theta, optima.sigma  # near the next optimum

@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 from fitact.compiled import jit
 from fitact.experiment.fisher import covariance_factor
 from fitact.fitting.minimum import minimise, result_name
-from fitact.fitting.timing import clock_r_squared, explained_square, free_timing, orthonormal_basis
+from fitact.fitting.score_test import explained_squares
+from fitact.fitting.timing import clock_r_squared, free_timing
 from fitact.likelihood.certificate import can_interpolate, expand_student, interpolate_channel, recompress
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.compression import HUM_FREQUENCIES, Interpolation
@@ -331,30 +332,29 @@ def _bic_decreases(
     starts = np.cumsum([0, *(x.size for x in residuals)])
     off_prior, prior_jacobian = solution.prior
     parts = [j[: x.size] for j, x in zip(solution.jacobian, residuals, strict=True)]
-    columns = [np.concatenate([*parts, prior_jacobian])]
+    fitted = [np.concatenate([*parts, prior_jacobian]).T]
 
-    def pad_columns(index: int, shapes: np.ndarray) -> np.ndarray:
-        """Return the columns of one channel, padded with zeros for the others."""
+    def pad_shapes(index: int, shapes: np.ndarray) -> np.ndarray:
+        """Return the shapes of one channel, padded with zeros for the others."""
         around = (starts[index], starts[-1] - starts[index + 1] + off_prior.size)
-        return np.pad(np.atleast_2d(shapes) / sigma[index], ((0, 0), around)).T
+        return np.pad(np.atleast_2d(shapes) / sigma[index], ((0, 0), around))
 
     candidates, gains = {}, {}
     for i, channel in enumerate(likelihood.channels):
         shapes, free = solution.shapes[i], channel.linear_sd > 0.0
-        columns.append(pad_columns(i, shapes[free[list(channel.columns)]]))
+        fitted.append(pad_shapes(i, shapes[free[list(channel.columns)]]))
         if "clock" in optional_nuisances[i] and "clock" not in channel.timing.free:
             fraction = clock_r_squared(channel, likelihood.channel_inputs(solution.theta, i), sigma[i])
             gains[i, "clock"] = bic_decrease(fraction, float(channel.count), 1)
         for name in optional_nuisances[i]:
             if name == "delay" and name not in channel.timing.free:
-                candidates[i, name] = pad_columns(i, solution.slope[i])
+                candidates[i, name] = pad_shapes(i, solution.slope[i])
             elif name in NUISANCES and not free[NUISANCES[name][0]]:
-                candidates[i, name] = pad_columns(i, shapes[list(NUISANCES[name])])
-    basis = orthonormal_basis(np.concatenate(columns, axis=1))
-    all_residuals = np.concatenate([*residuals, off_prior])
-    for (i, name), added in candidates.items():
-        fraction = explained_square(basis, added, all_residuals) / float(residuals[i] @ residuals[i])
-        gains[i, name] = bic_decrease(fraction, float(likelihood.channels[i].count), added.shape[1])
+                candidates[i, name] = pad_shapes(i, shapes[list(NUISANCES[name])])
+    explained = explained_squares(np.concatenate([*residuals, off_prior]), np.concatenate(fitted), candidates)
+    for (i, name), square in explained.items():
+        fraction = square / float(residuals[i] @ residuals[i])
+        gains[i, name] = bic_decrease(fraction, float(likelihood.channels[i].count), len(candidates[i, name]))
     return gains
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fitact.compiled import jit, pad_rows
+from fitact.fitting.score_test import explained_squares, orthonormalise
 from fitact.likelihood.certificate import recompress
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.likelihood import CircuitValues
@@ -89,10 +90,10 @@ def _residual_sums_of_squares(
     The signals of a `batch` are computed in parallel, but not more than `max_numbers` values at once.
     """
     observed, shapes = _observed_and_shapes(channel, inputs)
-    basis = orthonormal_basis(shapes[np.asarray(channel.linear_sd)[list(channel.columns)] > 0.0].T)
+    basis = orthonormalise(shapes[np.asarray(channel.linear_sd)[list(channel.columns)] > 0.0])
 
     def project_out(values: np.ndarray) -> np.ndarray:
-        return values - (values @ basis) @ basis.T
+        return values - (values @ basis.T) @ basis
 
     observed, sums = project_out(observed), []
     size = max(1, min(batch, max_numbers // observed.size))
@@ -122,22 +123,6 @@ def _signals(
     return jax.vmap(shifted_signal)(offsets)
 
 
-def orthonormal_basis(columns: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, "rows rank"]:
-    """Return an orthonormal basis of the column space; dependent columns are dropped up to rounding."""
-    q, r = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))
-    modes, sizes, _ = np.linalg.svd(r)
-    return q @ modes[:, sizes > 1e-9 * np.max(sizes, initial=0.0)]
-
-
-def explained_square(
-    basis: Float[np.ndarray, "rows rank"], added: Float[np.ndarray, "rows n"], residuals: Float[np.ndarray, " rows"]
-) -> float:
-    """Return the sum of squares of residuals that added columns explain, beside a `basis` of what is fitted."""
-    modes, sizes, _ = np.linalg.svd(added - basis @ (basis.T @ added), full_matrices=False)
-    kept = sizes > 1e-9 * max(float(np.linalg.norm(added)), 1e-300)
-    return float(np.sum(np.square(modes[:, kept].T @ residuals)))
-
-
 def clock_r_squared(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: float) -> float:
     """Return the fraction of the residual sum of squares that a free clock error would explain, to first order.
 
@@ -151,9 +136,10 @@ def clock_r_squared(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: fl
 
 
 def _r_squared(rows: np.ndarray) -> float:
-    basis = orthonormal_basis(rows[2:].T)
-    residuals = rows[1] - basis @ (basis.T @ rows[1])
-    return explained_square(basis, rows[:1].T, residuals) / max(float(residuals @ residuals), 1e-300)
+    clock, residuals, fitted = rows[:1], rows[1], rows[2:]
+    candidates = {"clock": clock, "all": residuals[None]}
+    explained = explained_squares(residuals, fitted[fitted.any(axis=1)], candidates)
+    return float(explained["clock"] / max(explained["all"], 1e-300))
 
 
 @functools.partial(jit, fast=True)
