@@ -24,7 +24,6 @@ from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics, sum
 from fitact.likelihood.observable import LINEAR_NUISANCES
 from fitact.model.chirp import Chirp
 from fitact.model.circuit import passes_direct_current
-from fitact.model.response_table import NODES, TABLE_HALF_WIDTH
 from fitact.model.skin import WithSkin
 from fitact.problem.build import MIN_RELATIVE_NOISE, Problem
 from fitact.problem.starting_point import VscEstimate
@@ -67,7 +66,7 @@ class StatedDriveProblem(BatchProblem):
         record = source.in_time
         time = record.time
         basis = SharedBasis.from_drive(choice.drive, time, choice.steady_state, start.b)
-        shared = dataclasses.replace(trace, compression=basis.compression(time.size), columns=()).without_samples()
+        shared = dataclasses.replace(trace, compression=basis.compression, columns=()).without_samples()
         return cls(
             likelihood=likelihood.replace_channel(0, shared),
             derive=derived.derived_from_fit(likelihood, record, choice, source.scene, start.b),
@@ -97,7 +96,7 @@ class StatedDriveProblem(BatchProblem):
         logs, gradients = _log_derived(self.derive, optima.theta, optima.sigma)
         square, tests = optima.sum_of_squares, None
         if whiteness:
-            fitted, functions = optima.fitted[:, : len(self.basis.signal)], self.basis.functions
+            fitted, functions = optima.fitted[:, : len(self.basis.compression.signal)], self.basis.functions
             from_samples, tests = _residual_statistics(functions, self.phases, fitted, observed)
             loss = np.abs(square - from_samples)
         else:
@@ -134,7 +133,7 @@ class StatedDriveProblem(BatchProblem):
         highest = products[np.arange(len(best)), best]
         in_table = (best > 0) & (best < len(tau) - 1) & (highest > 0.0)
         start = self.starting_points(highest / size[best], tau[best])
-        clock, tolerance = np.append(self.basis.clock, 0.0), np.asarray(self.settings.loop_tolerance)
+        clock, tolerance = self.basis.clock, np.asarray(self.settings.loop_tolerance)
         noise = np.maximum(noise, inputs.noise_floor)
         return find_optima(self.likelihood, self.settings, clock, tolerance, inputs, start, noise), in_table
 
@@ -142,8 +141,9 @@ class StatedDriveProblem(BatchProblem):
     def _table_responses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Time constants across the table (s), their responses to the drive (in columns), and the squared responses."""
         x = np.linspace(-1.0, 1.0, 257)
-        signal = self.basis.signal @ np.polynomial.chebyshev.chebvander(x, NODES - 1).T
-        return np.exp(self.basis.center + TABLE_HALF_WIDTH * x), signal, np.einsum("ij,ij->j", signal, signal)
+        table = self.basis.compression
+        signal = table.signal @ np.polynomial.chebyshev.chebvander(x, table.signal.shape[1] - 1).T
+        return np.exp(table.center + table.half_width * x), signal, np.einsum("ij,ij->j", signal, signal)
 
 
 @functools.partial(jit, fast=True)

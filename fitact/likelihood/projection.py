@@ -304,20 +304,22 @@ def _chunk_products(
     filtering: WhiteningState | None,
 ) -> tuple[Array, WhiteningState | None]:
     """Return the inner products of a chunk, for a drive whose response can be computed at any time."""
-    time = chunk.time
+    u, shapes, slope = evaluate_functions(table, drive, chunk.time, steady_state)
+    return _inner_products(table, [u], shapes if baseline is None else baseline, slope, chunk, filtering)
+
+
+def evaluate_functions(
+    table: TableNodes, drive: Drive, time: Float[Array, " n"], steady_state: bool
+) -> tuple[Float[Array, "nodes n"], Float[Array, "shapes n"], Float[Array, " n"]]:
+    """Return the responses of the nodes to a drive, the baseline functions, and dV/dt over two samples, at any time."""
 
     def respond(tau: Array) -> Array:
         return highpass(drive, time, tau, steady_state=steady_state)
 
     # the many pieces of a chirp are computed anew for each node, one node at a time to save memory
     u = lax.map(respond, table.nodes) if isinstance(drive, Chirp) else jax.vmap(respond)(table.nodes)
-
-    def voltage(time: Array) -> Array:
-        return jnp.where(steady_state | (time >= 0.0), drive.value(time), 0.0)
-
-    slope = (voltage(time + table.step) - voltage(time - table.step)) / (2.0 * table.step)
-    baseline = baseline_functions(time, table.middle, table.half) if baseline is None else baseline
-    return _inner_products(table, [u], baseline, slope, chunk, filtering)
+    before, after = (drive_voltage(drive, time + step, steady_state=steady_state) for step in (-table.step, table.step))
+    return u, baseline_functions(time, table.middle, table.half), (after - before) / (2.0 * table.step)
 
 
 def _inner_products(

@@ -152,7 +152,7 @@ def test_a_basis_of_hardly_more_functions_than_samples_holds_the_responses(sampl
         basis = SharedBasis.from_drive(fitact.Square(peak_to_peak=360.0, frequency=100.0), time, True, 3e-5)
     response = 360.0 / (1.0 + np.exp(-0.005 / 4e-5)) * np.exp(-time / 4e-5)
     coordinates = basis.project(response[None])
-    rank = len(basis.signal)
+    rank = len(basis.compression.signal)
     assert basis.functions[:, :rank] @ coordinates[0, :rank] == pytest.approx(response, abs=1e-9)
 
 
