@@ -8,6 +8,8 @@ from typing import Any
 
 from fitact.summary import (
     TRUSTED_RESULTS,
+    UNSTATED_GAINS,
+    UNSTATED_STRAY,
     Summary,
     combine,
     describe_quantity,
@@ -256,9 +258,9 @@ def next_measurements(content: dict[str, Any]) -> Rows:
 
 def _describe_default(source: str) -> tuple[str, str]:
     """Return the change that halves the uncertainty of a default, and what it needs."""
-    if source == "unstated gains":
+    if source == UNSTATED_GAINS:
         return "half the errors of gains", "state and calibrate your instruments ([instrument])"
-    if source == "unstated stray C":
+    if source == UNSTATED_STRAY:
         return (
             "half the uncertainty of the stray capacitance",
             "record once without a finger, or I in the ground lead",

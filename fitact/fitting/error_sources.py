@@ -1,6 +1,8 @@
 """Sources of error behind the coordinates of a fit, for its uncertainty budget."""
 
+import math
 from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -8,7 +10,7 @@ from jaxtyping import Float
 from fitact import summary
 from fitact.fitting.geometry import Contribution
 from fitact.fitting.least_squares import LeastSquaresResult
-from fitact.instrument.classes import USUAL_STRAY, typical_gains
+from fitact.instrument.classes import TYPICAL, USUAL_STRAY, typical_gains
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.skin import probe_parameters
 from fitact.prior.distributions import LogNormal, Uniform
@@ -19,10 +21,7 @@ from fitact.uncertainty.budget import Component, ErrorSource
 from fitact.uncertainty.effect_size import EffectSizes
 from fitact.units import format_engineering
 
-UNSTATED = "unstated gains"
 # cheapest ways to reduce an error
-_STATE_GAIN = "state your instruments under [instrument], and calibrate them with a dummy circuit"
-_STATE_STRAY = "record once without the finger ([[calibration]] circuit = 'open'), or take I in the ground lead"
 _CALIBRATE = "record a dummy circuit of known parts, or both channels on one node, with the same pieces and ranges"
 _MEASURE = {
     "Ci": "also record the current I, or measure Ci of this panel at this contact area",
@@ -80,22 +79,41 @@ def structure_components(effects: EffectSizes, quantity: str) -> tuple[Component
     return tuple(Component(name, "B", u, 1.0, *known) for name, u in found if u > 0.0)
 
 
-def unstated_components(errors: Mapping[str, float], stray: float) -> tuple[Component, ...]:
-    """Return the components of usual errors that nobody stated.
+class UnstatedError(NamedTuple):
+    """A usual error that nobody stated, with its components of the uncertainty of a quantity."""
 
-    `errors`: sensitivity to the gain of each channel, by channel. `stray`: relative change of the quantity by a stray
+    source: str
+    typical: str  # what is usual
+    components: tuple[Component, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return its entry in `not_stated` of fit.json."""
+        input_u, u = (math.hypot(*(getattr(each, name) for each in self.components)) for name in ("input_u", "u"))
+        return {"source": self.source, "typical": self.typical, "input_u": input_u, "u": u}
+
+
+def list_unstated_errors(gains: Mapping[str, float], stray: float) -> tuple[UnstatedError, ...]:
+    """Return the usual errors that nobody stated, of a quantity.
+
+    `gains`: its sensitivity to the gain of each channel, by channel. `stray`: its relative change by a stray
     capacitance of `USUAL_STRAY`, which any value from 0 to there is taken to be as likely as.
     """
-    rows = []
-    for channel, sensitivity in errors.items():
+    errors = []
+    known = "", False, True  # no advice, beyond the posterior, and the same in all records of a session
+    for channel, sensitivity in gains.items():
+        components = []
         for name, tolerance in typical_gains(channel).items():
-            law = Uniform.with_tolerance(1.0, tolerance)
-            source = f"{channel} gain of a usual {name}, not stated"
-            rows.append(Component(source, "B", float(law.log_sd), sensitivity, law, _STATE_GAIN, False, True, UNSTATED))
+            law, source = Uniform.with_tolerance(1.0, tolerance), f"{channel} gain of a usual {name}, not stated"
+            components.append(
+                Component(source, "B", float(law.log_sd), sensitivity, law, *known, summary.UNSTATED_GAINS)
+            )
+        errors.append(UnstatedError(f"{channel} gain", " and ".join(TYPICAL[channel]), tuple(components)))
     if stray:
-        source = f"stray capacitance, not stated (0 to {format_engineering(USUAL_STRAY, 'F')})"
-        rows.append(Component(source, "B", 3.0**-0.5, stray, None, _STATE_STRAY, False, True, "unstated stray C"))
-    return tuple(rows)
+        typical = f"0 to {format_engineering(USUAL_STRAY, 'F')}"
+        source = f"stray capacitance, not stated ({typical})"
+        component = Component(source, "B", 3.0**-0.5, stray, None, *known, summary.UNSTATED_STRAY)
+        errors.append(UnstatedError("stray capacitance", typical, (component,)))
+    return tuple(errors)
 
 
 def _instrument_source(error: InstrumentError) -> ErrorSource:

@@ -17,14 +17,18 @@ from fitact.experiment.fisher import Experiment
 from fitact.fitting import derived
 from fitact.fitting.channel_fit import ChannelFit
 from fitact.fitting.effects import assess_fit, describe_alternatives, describe_structure
-from fitact.fitting.error_sources import geometry_component, structure_components, unstated_components
+from fitact.fitting.error_sources import (
+    UnstatedError,
+    geometry_component,
+    list_unstated_errors,
+    structure_components,
+)
 from fitact.fitting.fit_figures import plot_fit, plot_identifiability
 from fitact.fitting.geometry import Contribution
 from fitact.fitting.identifiability import Identifiability, assess_identifiability, assess_parameters
 from fitact.fitting.laplace import Laplace
 from fitact.fitting.outcome import RESULTS
 from fitact.fitting.profile import PROFILE_QUANTITIES, Interval, profile_intervals
-from fitact.instrument.classes import TYPICAL, USUAL_STRAY, typical_gain_u
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import scale_information
 from fitact.model.circuit import FINGER_PARAMETERS
@@ -38,7 +42,7 @@ from fitact.scene.scene import Scene
 from fitact.tables import Display, to_dataframe
 from fitact.uncertainty.budget import Budget, ErrorSource, laplace_components
 from fitact.uncertainty.effect_size import NO_EFFECTS, EffectSizes
-from fitact.units import format_engineering, quantity_unit
+from fitact.units import quantity_unit
 
 _RESPONSE = {
     "constant": "exact",
@@ -248,8 +252,8 @@ class Fit(Display):
             # the scale of a force has the uncertainty of the force that it scales
             in_geometry = geometry["force_mean" if name == "force_scale" else name]
             others = (*map(geometry_component, in_geometry), *structure_components(self.effects, name))
-            sensitivities = self._unstated_sensitivities(name)
-            budgets[name] = Budget((*components, *others), unstated_components(*sensitivities))
+            unstated = tuple(part for error in self._list_unstated_errors(name) for part in error.components)
+            budgets[name] = Budget((*components, *others), unstated)
         return budgets
 
     @property
@@ -272,12 +276,8 @@ class Fit(Display):
         found = {name: gradients[name] for name in names if name in gradients} | dict(derivatives)
         return {name: gradient for name, gradient in found.items() if name not in self.assumed_quantities}
 
-    def _unstated_sensitivities(self, name: str) -> tuple[dict[str, float], float]:
-        """Return what errors that nobody stated change in the logarithm of a quantity.
-
-        The first is its derivative in the logarithm of each channel's gain, the second its change by a usual stray
-        capacitance.
-        """
+    def _list_unstated_errors(self, name: str) -> tuple[UnstatedError, ...]:
+        """Return the usual errors that nobody stated, of a quantity."""
         section, measurement = self.scene.instrument, self.scene.measurement
         stated = {"Vsc": measurement.gain_relative_sd > 0.0, "I": measurement.gain_I_relative_sd > 0.0}
         gradient, gains = self._gradients[name], {}
@@ -289,22 +289,12 @@ class Fit(Display):
             gains[channel] = float(gradient @ shift) + direct
         changes = dict(zip(self.names, gradient, strict=True))
         stray = sum(math.log1p(size) * changes.get(other, 0.0) for other, size in self.stray_changes.items())
-        return gains, stray
+        return list_unstated_errors(gains, stray)
 
     def calibration_entry(self, name: str) -> dict[str, Any]:
         """Return `stated` and `not_stated` of the budget of a quantity: usual errors that nobody stated."""
-        gains, stray = self._unstated_sensitivities(name)
-        entries: list[dict[str, Any]] = []
-        for channel, sensitivity in gains.items():
-            input_u, typical = typical_gain_u(channel), " and ".join(TYPICAL[channel])
-            u = abs(sensitivity) * input_u
-            entries.append({"source": f"{channel} gain", "typical": typical, "input_u": input_u, "u": u})
-        if stray:
-            typical = f"0 to {format_engineering(USUAL_STRAY, 'F')}"
-            input_u = 3.0**-0.5
-            u = abs(stray) * input_u
-            entries.append({"source": "stray capacitance", "typical": typical, "input_u": input_u, "u": u})
-        return {"stated": self.scene.instrument.is_stated, "not_stated": entries}
+        errors = self._list_unstated_errors(name)
+        return {"stated": self.scene.instrument.is_stated, "not_stated": [each.to_dict() for each in errors]}
 
     def unchanged_force_u(self) -> tuple[float, float, str]:
         """Return u of the log mean force from what no suggested measurement changes, now and after it, and the sources.
