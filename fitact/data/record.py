@@ -14,7 +14,7 @@ from jaxtyping import Float
 from fitact import charts
 from fitact.compiled import empty_aligned
 from fitact.data.clipping import clipping_mask, replace_codes
-from fitact.errors import InputError
+from fitact.errors import RATE_OPTION, InputError, channel_option
 from fitact.tables import Display, to_dataframe
 from fitact.units import format_engineering
 
@@ -28,7 +28,7 @@ CHANNEL_TITLES = {"V": "drive V", "Vsc": "skin voltage Vsc", "I": "loop current 
 _SHARED_TIMES: weakref.WeakValueDictionary[tuple[float, ...], np.ndarray] = weakref.WeakValueDictionary()
 
 # remedy for times with too few digits
-STATE_RATE = "state the sampling rate (--rate, or [measurement] sampling_rate in a scene)"
+STATE_RATE = f"state the sampling rate, as {RATE_OPTION} or [measurement] sampling_rate in a scene"
 
 _RowLabel = Callable[[int], str]
 
@@ -94,7 +94,7 @@ class Record(Display):
             have = ", ".join(f"{name}_{CHANNEL_UNITS[name]}" for name in self.channels)
             raise InputError(
                 f"{self.source}: the channel {channel}_{CHANNEL_UNITS[channel]} is missing (found: {have});"
-                f" record it, name it in the header, or name its column, as --channel {channel}=COLUMN"
+                f" record it, name it in the header, or name its column, as {channel_option({channel: 'COLUMN'})}"
             ) from None
 
     def __contains__(self, channel: object) -> bool:

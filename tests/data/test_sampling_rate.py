@@ -15,7 +15,7 @@ from fitact.cli import main
 from tests.conftest import square_record
 
 SCOPY = Path(__file__).parents[3] / "shared" / "real" / "scopes" / "Lab1_Square_7kHz.csv"
-REMEDY = "state the sampling rate (--rate, or [measurement] sampling_rate in a scene)"
+REMEDY = "state the sampling rate, as --rate 100kHz (in Python: rate=100e3) or [measurement] sampling_rate in a scene"
 START = -3e-3  # s, of the records
 
 

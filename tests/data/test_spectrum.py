@@ -256,20 +256,6 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("name", list(BROKEN))
-def test_bad_files_are_refused(tmp_path: Path, name: str):
-    lines, match = BROKEN[name]
-    with pytest.raises(fitact.InputError, match=match):
-        fitact.read_spectrum(broken(tmp_path, *lines))
-
-
-def test_a_record_is_no_spectrum_and_a_spectrum_no_record(tmp_path: Path, finger_path: Path):
-    with pytest.raises(fitact.InputError, match="is a spectrum, without time"):
-        fitact.read(write(tmp_path / "plain.csv", *FILES["plain.csv"], impedance(FREQUENCY, **TRUTH)))
-    with pytest.raises(fitact.InputError, match="no line names a frequency"):
-        fitact.read_spectrum(finger_path)
-
-
 @pytest.mark.parametrize("noise", [0.0, 1e-3, 3e-2])
 def test_kramers_kronig_passes_what_a_circuit_gives(noise: float):
     """For each seed, noise fails with probability 2e-4 at most."""

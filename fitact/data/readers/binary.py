@@ -135,11 +135,11 @@ def _read_tdms(path: Path, source: str, pick: Pick) -> Capture:
             contents.add(name, channel[:], channel.properties.get("unit_string", ""))
             if name in contents.arrays and "wf_increment" in channel.properties:
                 times.append(channel.time_track())
+        if said:  # nptdms reads a truncated file without an error
+            raise InputError(f"{source}: is truncated or damaged ({said[0][:120]}); export the record again")
         if len(times) == len(contents.arrays) and times:
             _check_one_grid(times, list(contents.arrays), source)
             contents.add("time", times[0], "s")
-    if said:  # nptdms reads a truncated file without an error
-        raise InputError(f"{source}: is truncated or damaged ({said[0][:120]}); export the record again")
     return _make_capture(contents, source, pick)
 
 
@@ -199,12 +199,12 @@ def _make_capture(contents: _Contents, source: str, pick: Pick) -> Capture:
     others = [name for name in arrays if not timed or name != timed[0]]
     short = [last[name][0] for name in others]
     names = others if len(set(short)) < len(short) else short
+    if not names:
+        raise InputError(f"{source}: has no one-dimensional array except the time; store V, Vsc or I in it")
     wanted = set(pick(names, ""))
     chosen = [(name, other) for name, other in zip(names, others, strict=True) if name in wanted]
     if "yinc" in contents.metadata and any(arrays[other].dtype.kind in "iu" for _, other in chosen):
         raise InputError(f"{source}: holds ADC counts with a manufacturer's scale (YInc); export volts, or CSV")
-    if not chosen:
-        raise InputError(f"{source}: has no one-dimensional array except the time; store V, Vsc or I in it")
     if timed:
         unit = last[timed[0]][1] or contents.units[timed[0]]
         time = layouts.convert_time(arrays[timed[0]].astype(float), unit, source, "store seconds")

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import shlex
 from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
@@ -10,7 +9,7 @@ from jaxtyping import Float
 
 from fitact.data.readers.layouts import normalize_channel, parse_unit
 from fitact.data.record import CHANNEL_UNITS, Record, is_rounded_grid
-from fitact.errors import InputError
+from fitact.errors import RATE_OPTION, InputError, channel_option, scale_option
 from fitact.units import format_engineering
 
 FULL_SCALE = "full scale"  # unit of a file whose values are parts of the range of its converter
@@ -63,21 +62,25 @@ def resolve_channels(names: list[str], channels: Mapping[str, str], source: str,
         own = [name for name in names if name.lower() == channel.lower()]
         if own and channel not in channels:
             if len(own) > 1:
-                raise InputError(f"{source}{location}: two columns are named {channel}; keep one")
+                raise InputError(f"{source}{location}: two columns are named {channel}; keep or rename one")
             known[channel] = own[0]
     for channel, asked in channels.items():
         if channel not in CHANNEL_UNITS:
-            raise InputError(f"{source}: '{channel}' is no channel of fitact; map to {', '.join(CHANNEL_UNITS)}")
+            raise InputError(
+                f"{source}: '{channel}' is no channel of fitact ({', '.join(CHANNEL_UNITS)}); name one of these, as"
+                f" {channel_option({'Vsc': asked})}"
+            )
         known[channel] = find_channel(asked, names, source)
     if len(set(known.values())) < len(known):
         pairs = ", ".join(f"{channel}={name}" for channel, name in known.items())
-        raise InputError(f"{source}: one column is to be two channels ({pairs}); name another for one of them")
+        raise InputError(
+            f"{source}: one column is to be two channels ({pairs}); name another for one of them with --channel"
+        )
     if not known:
-        examples = zip(("V", "Vsc"), names[-2:] if len(names) > 1 else ["NAME", *names], strict=False)
-        example = " ".join(f"--channel {shlex.quote(f'{channel}={name}')}" for channel, name in examples)
+        example = dict(zip(("V", "Vsc") if len(names) > 1 else ("Vsc",), names[-2:], strict=True))
         raise InputError(
             f"{source}{location}: no column is named time_s, V_V, Vsc_V or I_A, and which is which is not guessed"
-            f" (found: {_join_names(names)}); say it, as {example} (in Python: channels={{'Vsc': ...}})"
+            f" (found: {_join_names(names)}); name them, as {channel_option(example)}"
         )
     return known
 
@@ -88,7 +91,10 @@ def find_channel(requested: str, names: list[str], source: str) -> str:
     alike = exact or [name for name in names if normalize_channel(name) == normalize_channel(requested)]
     if len(alike) != 1:
         what = f"there are {len(alike)} columns" if alike else "there is no column"
-        raise InputError(f"{source}: {what} '{requested}'; the file has {_join_names(names)}")
+        raise InputError(
+            f"{source}: {what} '{requested}' (found: {_join_names(names)}); name another with --channel, or rename it"
+            " in the file"
+        )
     return alike[0]
 
 
@@ -103,15 +109,22 @@ def channel_arrays(
     """Return V, Vsc, I and Ft in SI units, the names of their columns, and notes on how they were converted."""
     for channel, factor in scale.items():
         if channel not in CHANNEL_UNITS:
-            raise InputError(f"{capture.source}: '{channel}' is no channel of fitact; scale {', '.join(CHANNEL_UNITS)}")
+            raise InputError(
+                f"{capture.source}: '{channel}' is no channel of fitact ({', '.join(CHANNEL_UNITS)}); scale one of"
+                f" these, as {scale_option('Vsc')}"
+            )
         if not math.isfinite(factor) or factor == 0.0:
             raise InputError(
-                f"{capture.source}: the scale {factor} of {channel} is no factor; give a number such as 10"
+                f"{capture.source}: the scale {factor} of {channel} is no factor; give a number, as"
+                f" {scale_option(channel)}"
             )
     names = [trace.name for trace in capture.channels]
     known = resolve_channels(names, channels, capture.source, capture.channels[0].location if capture.channels else "")
     if unused := sorted(set(scale) - set(known)):
-        raise InputError(f"{capture.source}: {unused[0]} is scaled but not there; name its column with --channel")
+        raise InputError(
+            f"{capture.source}: {unused[0]} is scaled but not there (found: {_join_names(names)}); name its column, as"
+            f" {channel_option({unused[0]: 'COLUMN'})}"
+        )
     arrays, notes = {}, list[str]()
     for channel, name in known.items():
         trace = capture.channels[names.index(name)]
@@ -130,7 +143,9 @@ def replace_rounded_times(capture: Capture, rate: float | None, scene_rate: floa
     """
     exact = 1e-6  # deviation in steps up to which times stay as they are
     if rate is not None and not 0.0 < rate < math.inf:
-        raise InputError(f"rate = {rate:g} Hz is no sampling rate; give a positive number of Hz")
+        raise InputError(
+            f"{capture.source}: rate = {rate:g} Hz is no sampling rate; give a positive one, as {RATE_OPTION}"
+        )
     time, stated = capture.time, scene_rate if rate is None else rate
     if stated is None or time.size < 4 or not np.all(np.isfinite(time)):
         return capture
@@ -148,7 +163,10 @@ def replace_rounded_times(capture: Capture, rate: float | None, scene_rate: floa
     if rate is None and np.all(np.diff(time) > 0.0):
         warning = f"{sentence}, more than rounding can explain; the times in the file are used"
         return dataclasses.replace(capture, warnings=(*capture.warnings, warning))
-    raise InputError(f"{sentence}, more than rounding can explain; state the rate of this file, or correct its times")
+    raise InputError(
+        f"{sentence}, more than rounding can explain; state the rate of this file, as {RATE_OPTION}, or correct its"
+        " times"
+    )
 
 
 def to_record(capture: Capture, channels: Mapping[str, str], scale: Mapping[str, float]) -> Record:
@@ -172,24 +190,24 @@ def to_record(capture: Capture, channels: Mapping[str, str], scale: Mapping[str,
 
 
 def _check_unit(file_channel: FileChannel, channel: str, scaled: bool, source: str) -> None:
-    wanted = CHANNEL_UNITS[channel]
-    if file_channel.unit_text == FULL_SCALE:
-        if scaled:
-            return
+    """Raise InputError if a channel has another unit than its own, and no factor between them is given."""
+    wanted, stated, place = CHANNEL_UNITS[channel], file_channel.unit_text, f"{source}{file_channel.location}"
+    if scaled or not stated or file_channel.unit == wanted:
+        return
+    if stated == FULL_SCALE:
         raise InputError(
-            f"{source}: {file_channel.name} holds parts of the full scale and no {wanted}; give the full scale, as"
-            f" --scale {channel}=10 for 10 {wanted}"
+            f"{place}: {file_channel.name} holds parts of the full scale and no {wanted}; give the full scale, for 10"
+            f" {wanted} as {scale_option(channel)}"
         )
-    if file_channel.unit_text and not file_channel.unit:
+    if not file_channel.unit:
         raise InputError(
-            f"{source}{file_channel.location}: '{file_channel.unit_text}' is no unit of {channel}; write a multiple"
-            f" of {wanted}"
+            f"{place}: '{stated}' is no unit of {channel}; correct it to a multiple of {wanted}, or give the factor to"
+            f" {wanted}, as {scale_option(channel, 0.001)}"
         )
-    if file_channel.unit and file_channel.unit != wanted and not scaled:
-        raise InputError(
-            f"{source}{file_channel.location}: {file_channel.name} is in {file_channel.unit}, but {channel} needs"
-            f" {wanted}; give the factor between them, as --scale {channel}=0.001 for {wanted} per {file_channel.unit}"
-        )
+    raise InputError(
+        f"{place}: {file_channel.name} is in {file_channel.unit}, but {channel} needs {wanted}; give the factor between"
+        f" them, in {wanted}/{file_channel.unit}, as {scale_option(channel, 0.001)}"
+    )
 
 
 def _describe_conversion(file_channel: FileChannel, channel: str, factor: float) -> str:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from fitact.data.readers import layouts
-from fitact.errors import InputError
+from fitact.errors import RATE_OPTION, InputError
 
 _EXAMPLE = "time_s,V_V,Vsc_V,I_A"
 MINUS = "\N{MINUS SIGN}"  # as typeset, in place of the hyphen
@@ -47,8 +47,10 @@ def read_header(
     if not header.is_plain:
         header = Header.from_text(text, sidecar_text, source)
     if not header.numeric:
+        first = text.partition("\n")[0].strip()[:60]
         raise InputError(
-            f"{source}: there are no rows of numbers; expected a header such as {_EXAMPLE}, and rows of numbers"
+            f"{source}: there are no rows of numbers (the first line is '{first}'); write them below a header such as"
+            f" {_EXAMPLE}"
         )
     maker = next((maker for maker, mark in layouts.MAKERS if mark.search(head)), "text")
     numeric, is_clock = header.numeric | header.standard_columns(), is_clock and header.clock is not None
@@ -63,10 +65,13 @@ def read_header(
         beside = " put NAME.csv, which holds the time, beside it," if source.lower().endswith(".wfm.csv") else ""
         raise InputError(
             f"{source}{header.location}: no column time_s, and no other time column ({found}{named});{beside} name the"
-            f" columns as in {_EXAMPLE}, or give the sampling rate, as --rate 100kHz"
+            f" columns as in {_EXAMPLE}, or give the sampling rate, as {RATE_OPTION}"
         )
     if not header.channels:
-        raise InputError(f"{source}{header.location}: there is no column of numbers except the time; export channels")
+        raise InputError(
+            f"{source}{header.location}: the only column of numbers is the time; export V, Vsc or I beside it, as in"
+            f" {_EXAMPLE}"
+        )
     return header
 
 

@@ -22,7 +22,7 @@ from fitact.data.readers.spectrum import is_spectrum, read_spectrum
 from fitact.data.readers.text import PADDING, is_binary, read_text
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.data.spectrum import Spectrum
-from fitact.errors import InputError
+from fitact.errors import InputError, channel_option
 from fitact.files import atomic_write, read_head
 
 if TYPE_CHECKING:
@@ -81,8 +81,8 @@ def read(
     if "V" not in record and (scene is None or scene.drive.waveform == "measured"):
         place = capture.channels[0].location
         raise InputError(
-            f"{source}{place}: the column V_V is missing and no scene states the drive;"
-            " record the drive, or name its waveform under [drive] in a scene file"
+            f"{source}{place}: the column V_V is missing and no scene states the drive; record the drive, name its"
+            f" column, as {channel_option({'V': 'COLUMN'})}, or name its waveform under [drive] in a scene file"
         )
     return record
 
@@ -97,13 +97,16 @@ def read_capture(
     source, path = os.fspath(path), Path(path)
     head = read_head(path)
     if not head.strip():
-        raise InputError(f"{source}: the file holds no data; expected a header such as time_s,V_V,Vsc_V,I_A")
+        raise InputError(f"{source}: the file holds no data; record again, or export it again as CSV")
     if head[:2] == b"\x1f\x8b":
         return read_text(path, source, pick, rate)
     if is_binary(head.rstrip(PADDING)) or is_known_binary(head, path.suffix):
         return read_binary(path, source, head, pick)
     if is_spectrum(path):
-        raise SpectrumFileError(f"{source}: is a spectrum, without time, and this needs a record in time")
+        raise SpectrumFileError(
+            f"{source}: is a spectrum, without time, and this needs a record in time; give a record, or read it with"
+            " fitact.read_spectrum, as fitact inspect and fitact fit do"
+        )
     return read_text(path, source, pick, rate)
 
 

@@ -105,10 +105,13 @@ def read_spectrum(path: str | os.PathLike[str], number: int | None = None, shunt
     spectra = read_spectra(path, shunt)
     if number is None and len({spectrum.fingerprint for spectrum in spectra}) > 1:
         raise InputError(
-            f"{os.fspath(path)}: holds {len(spectra)} spectra; choose one (--spectrum 1 to {len(spectra)})"
+            f"{os.fspath(path)}: holds {len(spectra)} spectra; choose one, as --spectrum 1 (in Python: number=1)"
         )
     if not 1 <= (number or 1) <= len(spectra):
-        raise InputError(f"{os.fspath(path)}: holds {len(spectra)} spectra, so there is no number {number}")
+        raise InputError(
+            f"{os.fspath(path)}: holds {len(spectra)} spectra, so there is no number {number}; choose another with"
+            " --spectrum (in Python: number=1)"
+        )
     return spectra[(number or 1) - 1]
 
 

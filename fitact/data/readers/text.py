@@ -18,7 +18,7 @@ from jaxtyping import Float
 from fitact.data.readers import layouts
 from fitact.data.readers.capture import Capture, FileChannel, Pick
 from fitact.data.readers.header import MINUS, Column, Header, parse_number, read_header, split_cells
-from fitact.errors import InputError
+from fitact.errors import RATE_OPTION, InputError
 from fitact.files import read_error
 from fitact.progress import track_progress
 from fitact.units import format_engineering
@@ -372,7 +372,7 @@ class _TableParser:
             coarse = format_engineering(float(np.min(steps[steps > 0.0], initial=np.inf)), "s", 2)
             raise InputError(
                 f"{self._source}: the times of day have a resolution of {coarse}, in which several rows fall; give the"
-                " sampling rate, as --rate 100kHz, or write more digits"
+                f" sampling rate, as {RATE_OPTION}, or write more digits"
             )
         return since
 
@@ -399,7 +399,6 @@ class _TableParser:
             warnings = [] if stated else [f"{self._source}: the file states no unit of time; seconds were assumed"]
             return layouts.convert_time(time, header.time.unit, place, "write a multiple of s"), [], warnings
         start, step = header.time_grid
-        if step is None:
-            raise InputError(f"{place}: the file has neither times nor a time step; export the time as well")
+        assert step is not None  # `read_header` refuses a file with neither
         notes = [] if start is not None else [f"{self._source}: the time was taken to start at 0"]
         return (start or 0.0) + step * time, notes, []

@@ -1,0 +1,348 @@
+"""Each refusal of a reader: a file that reaches it, and its sentence, which says what was found and what helps."""
+
+import ast
+import contextlib
+import dataclasses
+import functools
+import gzip
+import re
+import sys
+import types
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.io
+
+import fitact
+from fitact.data import inspection, record, spectrum
+from fitact.data.readers import binary, capture, header, layouts, matlab, read, stream, text
+from fitact.data.readers import spectrum as spectrum_files
+from tests.data.test_bad_input import KINDS, make_file
+from tests.data.test_layouts import REFUSED as REFUSED_LAYOUTS
+from tests.data.test_layouts import TIME as TIMES
+from tests.data.test_layouts import VSC, V, rows
+from tests.data.test_scope_files import NAMED, SCOPE, SKIN, TIME, WAVES
+from tests.data.test_spectrum import BROKEN, FILES, FREQUENCY, TRUTH, impedance
+from tests.data.test_spectrum import broken as write_broken
+from tests.data.test_spectrum import write as write_spectrum
+
+READERS = (
+    binary, capture, header, layouts, matlab, read, stream, text, spectrum_files, record, spectrum, inspection,
+)  # fmt: skip
+OPTIONS = {"--rate": "rate=", "--channel": "channels=", "--scale": "scale=", "--spectrum": "number="}
+REMEDIES = re.compile(
+    r"--[a-z]|\b(add|average|begin|check|choose|correct|drop|export|give|interpolate|keep|measure|name|pip|put|record"
+    r"|remove|rename|save|scale|shorten|sort|state|store|write)\b"
+)
+MAKERS = [
+    *(maker for maker, _ in layouts.MAKERS if maker not in ("fitact", "text")),
+    "Tektronix", "Scopy", "Yokogawa", "Hantek", "LabVIEW", "LTspice", "ngspice", "MATLAB", "Gamry", "NAME.csv",
+]  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Refusal:
+    """A file that is refused.
+
+    Attributes:
+        write: writes it into a folder, and returns its path.
+        words: regular expression of a part of the sentence.
+        options: arguments of `call` besides the path.
+        call: function that reads the file.
+        maker: name that the sentence may state, because the file is by this maker.
+        patched: module and attribute, or dictionary and key, and value, for conditions that a file cannot cause.
+    """
+
+    write: Callable[[Path], Path]
+    words: str
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    call: Callable[..., Any] = fitact.read
+    maker: str = ""
+    patched: tuple[Any, str, Any] | None = None
+
+
+def put(content: str | bytes, name: str = "record.csv") -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        path = folder / name
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+        return path
+
+    return write
+
+
+def scope(name: str, size: float = 1.0) -> Callable[[Path], Path]:
+    """Return the writer of the first part of a shipped file."""
+    content = (SCOPE / name).read_bytes()
+    return put(content[: int(size * len(content))], name)
+
+
+def npz(**arrays: Any) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        np.savez(folder / "record.npz", **arrays)
+        return folder / "record.npz"
+
+    return write
+
+
+def named(name: str, size: float) -> Callable[[Path], Path]:
+    """Return the writer of the first part of a file with named arrays."""
+
+    def write(folder: Path) -> Path:
+        NAMED[name](folder / name)
+        content = (folder / name).read_bytes()
+        return put(content[: int(size * len(content))], name)(folder)
+
+    return write
+
+
+def write_iq(folder: Path) -> Path:
+    scipy.io.savemat(folder / "iq.mat", {"sampleInterval": 4e-7, "IQData": np.exp(1j * TIME)})
+    return folder / "iq.mat"
+
+
+def write_zip(folder: Path) -> Path:
+    with zipfile.ZipFile(folder / "a.zip", "w") as file:
+        file.writestr("record.csv", "0,1,2\n")
+    return folder / "a.zip"
+
+
+def write_huge_hdf5(folder: Path) -> Path:
+    import h5py
+
+    with h5py.File(folder / "a.h5", "w") as file:
+        file.create_dataset("Vsc", (10**10,), "f8", chunks=(1000,))
+    return folder / "a.h5"
+
+
+def write_two_rates(folder: Path) -> Path:
+    nptdms = pytest.importorskip("nptdms")
+    with nptdms.TdmsWriter(str(folder / "a.tdms")) as file:
+        for step, (name, values) in zip((1e-5, 2e-5), WAVES.items(), strict=True):
+            file.write_segment(
+                [nptdms.ChannelObject("scope", name, values, {"wf_increment": step, "wf_start_offset": 0.0})]
+            )
+    return folder / "a.tdms"
+
+
+def write_two_files(folder: Path) -> Path:
+    for name, count in (("C1.csv", 300), ("C2.csv", 299)):
+        put("\n".join(["Time,Ampl", *rows(TIMES[:count], V[:count])]), name)(folder)
+    return folder / "C1.csv"
+
+
+def sweep(scale: complex = 1.0) -> Callable[[Path], Path]:
+    return lambda folder: write_spectrum(folder / "z.csv", *FILES["plain.csv"], scale * impedance(FREQUENCY, **TRUTH))
+
+
+def from_arrays(path: Path, **channels: np.ndarray) -> fitact.Record:
+    return fitact.Record.from_arrays(TIME, source=str(path), **channels)
+
+
+def spectrum_from_arrays(path: Path, frequency: np.ndarray, values: np.ndarray) -> fitact.Spectrum:
+    return fitact.Spectrum.from_arrays(frequency, values, str(path))
+
+
+def select_band(path: Path) -> fitact.Spectrum:
+    return fitact.read_spectrum(path).select_band(10.0, 15.0)
+
+
+def raise_an_error(*_: object) -> Any:
+    raise OSError("the disk is gone")
+
+
+GOOD = "\n".join(["time_s,V_V,Vsc_V", *rows(TIMES, V, VSC)]) + "\n"
+NO_CHANNELS = types.SimpleNamespace(Wfm=types.SimpleNamespace(from_file=lambda _: types.SimpleNamespace(channels=[])))
+KEYSIGHT = scope("keysight_scope_0.csv")
+REFUSALS: dict[str, Refusal] = {
+    **{
+        name: Refusal(functools.partial(make_file, name), re.escape(words), dict(*options))
+        for name, (verdict, _, words, *options) in KINDS.items()
+        if verdict == "refused"
+    },
+    **{name: Refusal(put("\n".join(lines)), words) for name, (lines, words) in REFUSED_LAYOUTS.items()},
+    **{
+        f"spectrum, {name}": Refusal(
+            lambda folder, lines=lines: write_broken(folder, *lines), words, call=fitact.read_spectrum
+        )
+        for name, (lines, words) in BROKEN.items()
+    },
+    # text
+    "header of another file": Refusal(
+        put("\n".join(rows(V, VSC)), "record.Wfm.csv"), r"put NAME\.csv, which holds the time", maker="NAME.csv"
+    ),
+    "header of another file, real": Refusal(scope("rs_rtp_01.Wfm.csv"), r"put NAME\.csv", maker="NAME.csv"),
+    "cut file, real": Refusal(
+        scope("tek_analog_waveform_first100lines.csv"), "states 50,000 rows, but the file has 86",
+        {"channels": {"Vsc": "REF7"}},
+    ),
+    "invalid file, real": Refusal(scope("tek_invalid_csv.csv"), "no column time_s"),
+    "invalid length, real": Refusal(scope("tek_invalid_record_length.csv"), "no column time_s"),
+    "time alone": Refusal(put("\n".join(["time_s", *rows(TIMES)])), "the only column of numbers is the time"),
+    "packed binary": Refusal(put(gzip.compress(bytes(range(256)) * 50)), "neither a text file"),
+    "endless line": Refusal(put(GOOD + "1" * 9_000_000), "has a line of 9,000,000 bytes"),
+    "text without end": Refusal(
+        put(GOOD), "of uncompressed text",
+        call=lambda path: text.read_text(path, str(path), lambda names, _: names, max_bytes=99),
+    ),
+    "disk that is gone": Refusal(
+        put(GOOD), "cannot be read", call=lambda path: list(stream.stream_record(path)),
+        patched=(stream, "_chunks", raise_an_error),
+    ),
+    # the assignment of columns
+    "unknown channel": Refusal(KEYSIGHT, "'U' is no channel of fitact", {"channels": {"U": "1"}}),
+    "current from volts": Refusal(
+        KEYSIGHT, r"1 is in V, but I needs A; .* --scale I=0.001", {"channels": {"I": "1", "Vsc": "2"}}
+    ),
+    "factor without a channel": Refusal(KEYSIGHT, "I is scaled but not there", {"channels": SKIN, "scale": {"I": 2.0}}),
+    "factor of an unknown channel": Refusal(KEYSIGHT, "'U' is no ch", {"channels": SKIN, "scale": {"U": 2.0}}),
+    "unknown name in another file": Refusal(
+        write_two_files, "there is no column 'B'", {"channels": {"Vsc": "Ampl", "V": "C1.csv:B"}}
+    ),
+    "files of two acquisitions": Refusal(
+        write_two_files, "same acquisition", {"channels": {"Vsc": "Ampl", "V": "C2.csv:Ampl"}}
+    ),
+    "negative rate": Refusal(put(GOOD), "is no sampling rate", {"rate": -1.0}),
+    "rate that is no number": Refusal(put(GOOD), "is no sampling rate", {"rate": np.nan}),
+    "rounded times without names": Refusal(
+        put("\n".join(["time_s,a,b", *rows(TIMES, V, VSC, form="%.3f")])), "times are not increasing",
+        call=fitact.inspect,
+    ),
+    "sound without its full scale": Refusal(
+        lambda folder: write_sound(folder, np.float32), r"give the full scale, for 10 V as --scale V=10",
+        {"channels": {"V": "1", "Vsc": "2"}},
+    ),
+    # binary files and arrays
+    "cut Keysight": Refusal(scope("agilent_1.bin", 0.8), r"cannot be read .*; export the record again"),
+    "cut LeCroy": Refusal(scope("lecroy_3.trc", 0.8), r"cannot be read .*; export the record again"),
+    "cut Rigol": Refusal(scope("rigol_DS2072A-5.wfm", 0.8), r"cannot be read .*; export the record again"),
+    "cut Rigol MSO": Refusal(scope("rigol_MSO5000-A.bin", 0.8), r"cannot be read .*; export the record again"),
+    "six samples": Refusal(
+        scope("tek_golden_analog.wfm"), "6 samples are too few", {"channels": {"Vsc": "CH 1"}}
+    ),
+    "missing extra": Refusal(
+        scope("agilent_1.bin"), r"needs RigolWFM, .* pip install 'fitact\[scope\]'",
+        patched=(sys.modules, "RigolWFM.wfm", None),
+    ),
+    "no channel": Refusal(
+        scope("agilent_1.bin"), "no analogue channel", patched=(sys.modules, "RigolWFM.wfm", NO_CHANNELS)
+    ),
+    "cut TDMS": Refusal(named("g.tdms", 0.7), "truncated or damaged"),
+    "two sampling rates": Refusal(
+        write_two_rates, "different times than 'drive'", {"channels": {"V": "drive", "Vsc": "skin"}}
+    ),
+    "cut MATLAB": Refusal(named("a.mat", 0.7), "cannot be read"),
+    "another zip": Refusal(write_zip, "is a zip archive"),
+    "complex numbers": Refusal(write_iq, "complex"),
+    "counts": Refusal(npz(XInc=1e-6, YInc=0.01, Vsc=np.arange(50)), "ADC counts"),
+    "arrays without time": Refusal(npz(Vsc=TIME), "has no time"),
+    "arrays without channels": Refusal(npz(time=TIME), "no one-dimensional array except the time"),
+    "huge array": Refusal(write_huge_hdf5, "more than the file can hold"),
+    # arrays of a program, in place of a file
+    "no channel given": Refusal(put(GOOD), "no channel was given", call=from_arrays),
+    "shapes": Refusal(put(GOOD), "has shape", {"Vsc": TIME[1:]}, from_arrays),
+    # spectra
+    "spectrum in place of a record": Refusal(sweep(), "is a spectrum, without time"),
+    "record in place of a spectrum": Refusal(put(GOOD), "no line names a frequency", call=fitact.read_spectrum),
+    "two spectra": Refusal(
+        lambda folder: write_two_sweeps(folder), "holds 2 spectra; choose one", call=fitact.read_spectrum
+    ),
+    "third of two spectra": Refusal(
+        lambda folder: write_two_sweeps(folder), "there is no number 3", {"number": 3}, fitact.read_spectrum
+    ),
+    "narrow band": Refusal(sweep(), "2 of 41 points", call=select_band),
+    "shapes of a spectrum": Refusal(
+        sweep(), "has shape", {"frequency": FREQUENCY, "values": FREQUENCY[1:]}, spectrum_from_arrays
+    ),
+    "frequency of zero": Refusal(
+        sweep(), "holds the frequency 0 Hz", {"frequency": np.arange(9.0), "values": np.ones(9)}, spectrum_from_arrays
+    ),
+}  # fmt: skip
+
+
+def write_sound(folder: Path, kind: type) -> Path:
+    scipy.io.wavfile.write(folder / "card.wav", 50_000, np.column_stack([V / 200.0, VSC / 20.0]).astype(kind))
+    return folder / "card.wav"
+
+
+def write_two_sweeps(folder: Path) -> Path:
+    first, second = (sweep(scale)(folder).read_text().splitlines() for scale in (1.0, 0.5))
+    return put("\n".join([*first, *second[1:]]), "z.csv")(folder)
+
+
+@dataclasses.dataclass(frozen=True)
+class Sentence:
+    """Answer to a file: the sentence, the path, and the file and line that raised it."""
+
+    text: str
+    path: str
+    site: tuple[str, int]
+
+    @property
+    def body(self) -> str:
+        return self.text.replace(self.path, "FILE")
+
+    @property
+    def remedy(self) -> str:
+        return self.body.partition("; ")[2]
+
+
+@pytest.fixture(scope="module")
+def sentences(tmp_path_factory) -> dict[str, Sentence]:
+    """Feed every reader what it refuses."""
+    said = {}
+    for name, refusal in REFUSALS.items():
+        path = refusal.write(tmp_path_factory.mktemp("refused"))
+        with contextlib.ExitStack() as stack:
+            if refusal.patched:
+                patch = stack.enter_context(pytest.MonkeyPatch.context())
+                set_value = patch.setitem if isinstance(refusal.patched[0], dict) else patch.setattr
+                set_value(*refusal.patched)
+            caught = stack.enter_context(pytest.raises(fitact.InputError))
+            refusal.call(path, **refusal.options)
+        frames = [(str(frame.path), frame.lineno + 1) for frame in caught.traceback]
+        site = next(frame for frame in reversed(frames) if frame[0] in {module.__file__ for module in READERS})
+        said[name] = Sentence(str(caught.value), str(path), site)
+    return said
+
+
+def raises() -> list[tuple[str, int, int]]:
+    """Return file, first and last line of each statement of the readers that raises InputError."""
+    found = []
+    for module in READERS:
+        for node in ast.walk(ast.parse(Path(str(module.__file__)).read_text("utf-8"))):
+            called = node.exc.func if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) else None
+            if isinstance(called, ast.Name) and called.id in ("InputError", "SpectrumFileError", "read_error"):
+                found.append((str(module.__file__), node.lineno, node.end_lineno or node.lineno))
+    return found
+
+
+def test_every_refusal_of_a_reader_has_a_file(sentences):
+    reached = [sentence.site for sentence in sentences.values()]
+    missing = [
+        f"{file}:{first}"
+        for file, first, last in raises()
+        if not any(site == file and first <= line <= last for site, line in reached)
+    ]
+    assert missing == []
+    assert len(raises()) >= 60
+
+
+@pytest.mark.parametrize("name", REFUSALS)
+def test_a_refusal_says_what_was_found_and_what_helps(name: str, sentences):
+    refusal, sentence = REFUSALS[name], sentences[name]
+    assert re.search(refusal.words, sentence.text), sentence.text
+    assert sentence.path in sentence.text
+    assert "\n" not in sentence.text
+    assert not re.search(r"\. [A-Z]", sentence.body), "two sentences"
+    assert len(sentence.body) < 400
+    assert REMEDIES.search(sentence.remedy), sentence.body
+    for option, argument in OPTIONS.items():
+        assert f"{option} " not in sentence.body or argument in sentence.body or "with " + option in sentence.body, (
+            f"{sentence.body} has no word on Python"
+        )
+    makers = [maker for maker in MAKERS if re.search(rf"\b{re.escape(maker)}\b", sentence.body)]
+    assert set(makers) <= {refusal.maker}, sentence.body
