@@ -307,6 +307,13 @@ def test_arrays_are_named_as_columns_are(tmp_path: Path):
     np.testing.assert_allclose(capture.channels[1].values, TIME, rtol=1e-15)
 
 
+def test_a_rate_gives_the_times_of_arrays_without(tmp_path: Path):
+    np.savez(tmp_path / "record.npz", V=WAVES["drive"], Vsc=WAVES["skin"])
+    record = fitact.read(tmp_path / "record.npz", rate=1e5)
+    np.testing.assert_allclose(record.time, TIME - TIME[0], atol=1e-15)
+    assert any("start at 0" in note for note in record.notes)
+
+
 # ---- assignment of the columns
 
 

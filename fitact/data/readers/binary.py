@@ -21,7 +21,7 @@ import numpy as np
 from fitact.data.readers import layouts
 from fitact.data.readers.capture import FULL_SCALE, Capture, FileChannel, Pick
 from fitact.data.readers.matlab import read_mat
-from fitact.errors import InputError
+from fitact.errors import RATE_OPTION, InputError
 
 h5py, scipy = lazy_loader.load("h5py"), lazy_loader.load("scipy")
 
@@ -57,8 +57,11 @@ def is_known_binary(head: bytes, suffix: str) -> bool:
     return _find_reader(head, "" if suffix.lower() in (".csv", ".txt") else suffix) is not None
 
 
-def read_binary(path: Path, source: str, head: bytes, pick: Pick) -> Capture:
-    """Return the channels of a binary file that `pick` selects, in SI units."""
+def read_binary(path: Path, source: str, head: bytes, pick: Pick, rate: float | None = None) -> Capture:
+    """Return the channels of a binary file that `pick` selects, in SI units.
+
+    `rate` (Hz) gives the times of arrays that state none.
+    """
     reader = _find_reader(head, path.suffix)
     if reader is None:
         raise InputError(f"{source}: is neither a text file nor a known binary format; export the record as CSV")
@@ -66,7 +69,9 @@ def read_binary(path: Path, source: str, head: bytes, pick: Pick) -> Capture:
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # from parsers that continue after a problem
-            return reader(path, source, pick)
+            if reader is _read_scope:
+                return _read_scope(path, source, pick)
+            return _make_capture(reader(path, source), source, pick, rate)
     except InputError:
         raise
     except Exception as error:  # a dozen parsers with exceptions of their own
@@ -74,7 +79,8 @@ def read_binary(path: Path, source: str, head: bytes, pick: Pick) -> Capture:
         raise InputError(f"{source}: cannot be read ({reason}); export the record again, or as CSV") from error
 
 
-def _find_reader(head: bytes, suffix: str) -> Callable[[Path, str, Pick], Capture] | None:
+def _find_reader(head: bytes, suffix: str) -> Callable[..., Any] | None:
+    """Return `_read_scope`, or the function of path and source that reads the contents of the file, or None."""
     readers = {
         b"\x89HDF\r\n\x1a\n": _read_hdf5, b"CDF": _read_netcdf3, b"TDSm": _read_tdms, b"PK\x03\x04": _read_npz,
         b"MATLAB 7.3": _read_hdf5, b"MATLAB": _read_mat, b"RIFF": _read_wav,
@@ -103,25 +109,19 @@ def _read_scope(path: Path, source: str, pick: Pick) -> Capture:
     return Capture(source, maker, times[0], tuple(channels), unread_columns=unread)
 
 
-def _read_wav(path: Path, source: str, pick: Pick) -> Capture:
+def _read_wav(path: Path, source: str) -> _Contents:
     """Read a sound file, whose values are parts of the full scale."""
     rate, data = scipy.io.wavfile.read(path)
-    table = data.reshape(len(data), -1)
     middle, size = (128.0, 128.0) if data.dtype == np.uint8 else (0.0, 1.0)
     if data.dtype.kind == "i":
         size = float(np.iinfo(data.dtype).max) + 1.0
-    names = [f"channel {i + 1}" for i in range(table.shape[1])]
-    wanted = set(pick(names, ""))
-    channels = tuple(
-        FileChannel(name, (table[:, i] - middle) / size, "", FULL_SCALE)
-        for i, name in enumerate(names)
-        if name in wanted
-    )
-    unread = tuple(name for name in names if name not in wanted)
-    return Capture(source, "sound file", np.arange(len(table)) / rate, channels, unread_columns=unread)
+    contents = _Contents("sound file", metadata={"fs": rate, "start": 0.0})
+    for i, values in enumerate(data.reshape(len(data), -1).T):
+        contents.add(f"channel {i + 1}", (values - middle) / size, FULL_SCALE)
+    return contents
 
 
-def _read_tdms(path: Path, source: str, pick: Pick) -> Capture:
+def _read_tdms(path: Path, source: str) -> _Contents:
     nptdms = _import_extra("nptdms", "tdms", source)
     with _capture_log("nptdms") as said, nptdms.TdmsFile.open(path) as file:
         pairs = [(group, channel) for group in file.groups() for channel in group.channels()]
@@ -140,17 +140,17 @@ def _read_tdms(path: Path, source: str, pick: Pick) -> Capture:
         if len(times) == len(contents.arrays) and times:
             _check_one_grid(times, list(contents.arrays), source)
             contents.add("time", times[0], "s")
-    return _make_capture(contents, source, pick)
+    return contents
 
 
-def _read_mat(path: Path, source: str, pick: Pick) -> Capture:
+def _read_mat(path: Path, source: str) -> _Contents:
     contents = _Contents("MATLAB")
     for name, value in read_mat(path.read_bytes(), _size_limit(path)):
         contents.add(name, value)
-    return _make_capture(contents, source, pick)
+    return contents
 
 
-def _read_npz(path: Path, source: str, pick: Pick) -> Capture:
+def _read_npz(path: Path, source: str) -> _Contents:
     contents = _Contents("NumPy")
     with np.load(path, allow_pickle=False) as file:
         if isinstance(file, np.ndarray) or not all(name.endswith(".npy") for name in file.zip.namelist()):
@@ -158,19 +158,19 @@ def _read_npz(path: Path, source: str, pick: Pick) -> Capture:
         _check_size(sum(part.file_size for part in file.zip.infolist()), path, source)
         for name in file.files:
             contents.add(name, file[name])
-    return _make_capture(contents, source, pick)
+    return contents
 
 
-def _read_netcdf3(path: Path, source: str, pick: Pick) -> Capture:
+def _read_netcdf3(path: Path, source: str) -> _Contents:
     contents = _Contents("NetCDF")
     with scipy.io.netcdf_file(path, mmap=False) as file:
         for name, variable in file.variables.items():
             _check_size(8 * int(np.prod(variable.shape)), path, source)
             contents.add(name, variable[...].copy(), getattr(variable, "units", ""))
-    return _make_capture(contents, source, pick)
+    return contents
 
 
-def _read_hdf5(path: Path, source: str, pick: Pick) -> Capture:
+def _read_hdf5(path: Path, source: str) -> _Contents:
     contents = _Contents("HDF5")
     with h5py.File(path, "r") as file:
 
@@ -185,10 +185,10 @@ def _read_hdf5(path: Path, source: str, pick: Pick) -> Capture:
 
         visit("", file)
         file.visititems(visit)
-    return _make_capture(contents, source, pick)
+    return contents
 
 
-def _make_capture(contents: _Contents, source: str, pick: Pick) -> Capture:
+def _make_capture(contents: _Contents, source: str, pick: Pick, rate: float | None) -> Capture:
     """Make a capture: find the time, or start and step of the time, among the named arrays, and the channels."""
     arrays = contents.arrays
     if any(array.dtype.kind == "c" for array in arrays.values()):
@@ -212,7 +212,7 @@ def _make_capture(contents: _Contents, source: str, pick: Pick) -> Capture:
         assumed = [] if unit else [f"{source}: the file states no unit of time; seconds were assumed"]
     else:
         assumed = []
-        time, notes = _time_grid(contents, arrays[chosen[0][1]].size, source)
+        time, notes = _time_grid(contents, arrays[chosen[0][1]].size, source, rate)
     for name, other in chosen:
         if arrays[other].size != time.size:
             raise InputError(
@@ -230,15 +230,19 @@ def _make_capture(contents: _Contents, source: str, pick: Pick) -> Capture:
     )
 
 
-def _time_grid(contents: _Contents, count: int, source: str) -> tuple[np.ndarray, list[str]]:
+def _time_grid(contents: _Contents, count: int, source: str, stated_rate: float | None) -> tuple[np.ndarray, list[str]]:
     def find(keys: Sequence[str]) -> float | None:
         return next((float(x) for x in map(contents.metadata.get, keys) if isinstance(x, int | float)), None)
 
     step, rate, start = (find(keys) for keys in (layouts.STEP_KEYS, layouts.RATE_KEYS, layouts.START_KEYS))
     zero = find(("zeroindex",))  # Tektronix
+    rate = rate or stated_rate
     step = 1.0 / rate if step is None and rate else step
     if step is None or not 0.0 < step < float("inf"):
-        raise InputError(f"{source}: has no time; store an array 'time' (s) with the channels, or the step as 'dt'")
+        raise InputError(
+            f"{source}: has no time; give the sampling rate, as {RATE_OPTION}, or store an array 'time' (s) or the step"
+            " 'dt' with the channels"
+        )
     notes = [] if start is not None or zero is not None else [f"{source}: the time was assumed to start at 0"]
     return step * (np.arange(count) - (zero or 0.0)) + (start or 0.0), notes
 

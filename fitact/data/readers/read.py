@@ -92,7 +92,7 @@ def read_capture(
 ) -> Capture:
     """Return time and channels of a file, by the names in the file; `pick` may select some of them.
 
-    `rate` (Hz) gives the times of a text file that states none.
+    `rate` (Hz) gives the times of a file that states none.
     """
     source, path = os.fspath(path), Path(path)
     head = read_head(path)
@@ -101,7 +101,7 @@ def read_capture(
     if head[:2] == b"\x1f\x8b":
         return read_text(path, source, pick, rate)
     if is_binary(head.rstrip(PADDING)) or is_known_binary(head, path.suffix):
-        return read_binary(path, source, head, pick)
+        return read_binary(path, source, head, pick, rate)
     if is_spectrum(path):
         raise SpectrumFileError(
             f"{source}: is a spectrum, without time, and this needs a record in time; give a record, or read it with"
