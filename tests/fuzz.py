@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 import fitact
+from fitact.data.preview import preview
 from fitact.data.readers.capture import resolve_channels
 from fitact.data.readers.read import read_capture
 from fitact.data.readers.spectrum import is_spectrum
@@ -128,6 +129,7 @@ def outcome(path: Path) -> str:
         fitact.inspect(path)
     except fitact.InputError as error:
         _one_sentence(error, path)
+        assert len(preview(path)) < 100_000  # characters
         return "refused"
     names = [trace.name for trace in capture.channels]
     try:

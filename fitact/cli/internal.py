@@ -11,6 +11,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "data.readers.read": ["read_any", "write_csv"],
         "data.simulate": ["simulate"],
         "data.kramers_kronig": ["check_kramers_kronig"],
+        "data.preview": ["preview"],
         "data.readers.spectrum": ["is_spectrum"],
         "data.study": ["is_study"],
         "design.drive": ["require_designable"],

@@ -30,8 +30,22 @@ def inspect(
 ) -> None:
     """Show the channels, units, sampling rate, noise, clipping and frequency of a file, and list possible problems.
 
-    Of a table of an experiment (a CSV with a column 'record'), show people, repetitions and covariates.
+    Of a table of an experiment (a CSV with a column 'record'), show people, repetitions and covariates. Of a file that
+    is refused, show the columns, the first rows and a guess at the command that reads it.
     """
+    try:
+        _inspect(file, (channel, scale, rate), (spectrum, shunt, band), out, json)
+    except InputError:
+        if not json:
+            rate_given = options.column_options((channel, scale, rate))["rate"]
+            if shown := internal.preview(file, rate_given):
+                print(shown, flush=True)
+        raise
+
+
+def _inspect(
+    file: Path, columns: options.Columns, choice: options.SpectrumChoice, out: Path | None, json: bool
+) -> None:
     if internal.is_study(file):
         if out is not None:
             raise InputError(f"--out {out}: draws a record, and {file} is a table of records; leave --out away")
@@ -39,7 +53,7 @@ def inspect(
         show(str(study), study.to_dict(), json)
         return
     if internal.is_spectrum(file):
-        spectra = options.read_spectra(file, (spectrum, shunt, band))
+        spectra = options.read_spectra(file, choice)
         tests = [internal.check_kramers_kronig(each) for each in spectra]
         text = "\n".join(f"{each}\n{test}" for each, test in zip(spectra, tests, strict=True))
         entries = [
@@ -49,7 +63,7 @@ def inspect(
             report.write_spectra(out, spectra)
         show(text, entries[0] if len(entries) == 1 else {"source": str(file), "spectra": entries}, json)
         return
-    inspection = fitact.inspect(file, **options.column_options((channel, scale, rate)))
+    inspection = fitact.inspect(file, **options.column_options(columns))
     if out is not None:
         report.write_record(out, inspection)
     show(str(inspection), inspection.to_dict(), json)

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import os
-import shlex
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.data.clipping import clipping_mask, has_flat_levels
+from fitact.data.preview import describe_rows, guess_command
 from fitact.data.readers.capture import Capture, FileChannel, has_standard_names, replace_rounded_times, to_record
 from fitact.data.readers.read import merge_other_files, read_capture
 from fitact.data.record import (
@@ -101,6 +101,8 @@ class Inspection:
             )
             rail = f", {channel.clipped:,} samples clipped" if channel.clipped else ""
             lines.append(f"  {channel.name:<{width}}  {low} to {high}, noise {noise}{rail}")
+        if not {"Vsc", "I"} & {channel.name for channel in self.channels}:
+            lines += ["first rows:", *describe_rows(self.columns, self.time)]
         return join_lines(lines, self.warnings, self.notes)
 
 
@@ -122,7 +124,10 @@ def inspect(
     if channels or scale or has_standard_names(capture):
         record = to_record(capture, channels or {}, scale or {})
         arrays = {name: (record[name], CHANNEL_UNITS[name]) for name in record.channels}
-        return _inspect_channels(capture, record.time, arrays, record.notes)
+        notes = record.notes
+        if not channels and not {"Vsc", "I"} & set(record.channels):
+            notes = (*notes, _assignment_note(capture, rate))
+        return _inspect_channels(capture, record.time, arrays, notes)
     time = capture.time
     if time.size < 2 or not np.all(np.isfinite(time)) or np.any(np.diff(time) <= 0.0):
         raise InputError(
@@ -130,25 +135,13 @@ def inspect(
             f" {STATE_RATE}; otherwise sort the rows, drop repeated ones, and check which column is time"
         )
     arrays = {trace.name: (trace.values, trace.unit) for trace in capture.channels}
-    names = ", ".join(arrays)
-    notes = (
-        *capture.notes,
-        *grid_notes(time, capture.source),
-        f"{capture.source}: for a fit, assign the channels {names}; by their units and sizes, which may mislead:"
-        f" {guess_command(capture)}",
-    )
+    notes = (*capture.notes, *grid_notes(time, capture.source), _assignment_note(capture, rate))
     return _inspect_channels(capture, time, arrays, notes)
 
 
-def guess_command(capture: Capture) -> str:
-    """Return the command that would fit the channels of a file: the largest voltage is V, a current I."""
-    kept = {trace.name: trace.values[np.abs(trace.values) < OVERFLOW] for trace in capture.channels}
-    size = {name: float(np.ptp(values)) if values.size else 0.0 for name, values in kept.items()}
-    currents = [trace.name for trace in capture.channels if trace.unit == "A"]
-    voltages = sorted((name for name in size if name not in currents), key=lambda name: -size[name])
-    guessed = dict(zip(("V", "Vsc"), voltages, strict=False)) | dict(zip(("I",), currents, strict=False))
-    options = (f"--channel {shlex.quote(f'{channel}={name}')}" for channel, name in guessed.items())
-    return " ".join(("fitact fit", shlex.quote(capture.source), *options))
+def _assignment_note(capture: Capture, rate: float | None) -> str:
+    reason, command = guess_command(capture, rate)
+    return f"{capture.source}: the channels are not assigned; guess {reason}" + f": {command}" * bool(command)
 
 
 def _inspect_channels(

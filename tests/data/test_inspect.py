@@ -3,15 +3,19 @@
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import matplotlib.image
 import numpy as np
 import pytest
+import scipy.io
 
 import fitact
+from fitact.cli import main
 from tests.data.test_scope_files import SCOPE
 
 
@@ -69,6 +73,97 @@ def test_inspect_shows_all_channels_and_draws_them(command, tmp_path: Path):
     )
     assert done.returncode == 2
     assert "choose one of these endings" in done.stderr
+
+
+def table(header: str, *columns: np.ndarray, delimiter: str = ",", digits: str = "%.9g") -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        path = folder / "a record.csv"
+        np.savetxt(path, np.column_stack(columns), digits, delimiter, header=header, comments="")
+        return path
+
+    return write
+
+
+def write_sound(folder: Path) -> Path:
+    scipy.io.wavfile.write(folder / "card.wav", 20_000, np.column_stack([V / 200.0, VSC / 20.0]))
+    return folder / "card.wav"
+
+
+def write_arrays(folder: Path) -> Path:
+    np.savez(folder / "a.npz", drive=V, skin=VSC)
+    return folder / "a.npz"
+
+
+TIME = 5e-5 * np.arange(400)
+V, VSC, CURRENT = 180.0 * np.sin(628.0 * TIME), 9.0 * np.cos(628.0 * TIME), 1e-6 * np.cos(628.0 * TIME)
+FREQUENCY, COUNT = np.geomspace(1.0, 1e5, 400), np.arange(400.0)
+BOTH = {"V": V, "Vsc": VSC}
+# file whose columns are not assigned: what writes it, exit status, and channels by the command, or a part of the guess
+UNASSIGNED = {
+    "unknown names": (table("time_s,CH1,CH2", TIME, VSC, V), 0, BOTH),
+    "blanks and quotes in names": (table("time_s,it's skin,my drive", TIME, VSC, V), 0, BOTH),
+    "tabs, units": (table("t [ms]\tU1 [mV]\tU2", 1e3 * TIME, 1e3 * VSC, V, delimiter="\t"), 0, BOTH),
+    "two times": (table("Time,Elapsed (s),a,b", TIME, TIME + 1.0, V, VSC), 0, BOTH),
+    "a count beside the time": (table("time_s,pulses,a,b", TIME, COUNT, V, VSC), 0, BOTH),
+    "another quantity": (table("time_s,a,T (deg),b", TIME, V, 1e3 * VSC, VSC), 0, BOTH),
+    "a current": (table("time_s,U (V),shunt (uA)", TIME, V, 1e6 * CURRENT), 0, {"V": V, "I": CURRENT}),
+    "one voltage": (table("time_s,CH1", TIME, VSC), 0, {"Vsc": VSC}),
+    "V alone is named": (table("time_s,V_V,skin", TIME, V, VSC), 0, BOTH),
+    "sound": (write_sound, 0, {"V": V / 20.0, "Vsc": VSC / 2.0}),
+    "no time": (table("skin;drive", VSC, V, delimiter=";"), 2, BOTH),
+    "no names": (table("", V, VSC), 2, BOTH),
+    "one column of values": (table("", VSC), 2, {"Vsc": VSC}),
+    "no header": (table("", TIME, V, VSC), 2, BOTH),
+    "no header, two times": (table("", TIME, TIME + 1.0, V, VSC), 2, BOTH),
+    "a count, no time": (table("n,a,b", COUNT, V, VSC), 2, BOTH),
+    "arrays without time": (write_arrays, 2, BOTH),
+    "rounded times": (table("time_s,a,b", TIME, V, VSC, digits="%.4f"), 2, BOTH),
+    "frequencies": (table("freq,A,B", FREQUENCY, V, VSC), 2, "guess by 'freq': a spectrum; name its columns"),
+    "frequencies, no header": (table("", FREQUENCY, V, VSC, CURRENT), 2, "guess by 'column 1': a spectrum"),
+    "a spectrum without units": (table("f_Hz,magnitude,phase", FREQUENCY, V, VSC), 2, "f_Hz,magnitude,phase"),
+    "times alone": (table("time_s", TIME), 2, "begins with:\n  time_s\n  0\n  5e-05"),
+    "nothing that varies": (table("a,b", 0.0 * V, COUNT), 2, "no other column is a voltage or a current"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", UNASSIGNED)
+def test_a_file_that_is_not_assigned_is_shown_with_the_command_that_reads_it(
+    name: str, tmp_path: Path, monkeypatch, capsys
+):
+    write, code, expected = UNASSIGNED[name]
+    path = write(tmp_path)
+
+    def run(*arguments: str) -> tuple[int, str]:
+        monkeypatch.setattr("sys.argv", ["fitact", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return int(str(ended.value.code)), capsys.readouterr().out
+
+    ended, shown = run("inspect", str(path))
+    assert ended == code
+    if isinstance(expected, str):
+        assert expected in shown
+        assert "fitact fit" not in shown
+        return
+    rows = [line.split() for line in shown.splitlines()]
+    assert any(f"{V[1]:.6g}" in row or f"{VSC[1]:.6g}" in row for row in rows) or name in ("sound", "rounded times")
+    (command,) = re.findall(r"fitact ((?:inspect|fit) .*)", shown)
+    found = {}
+
+    def stop(records: list[fitact.Record], *_: object, **__: object) -> None:
+        found.update(records[0].channels)
+        raise fitact.InputError("read")
+
+    monkeypatch.setattr("fitact.cli.internal.fit_planned", stop, raising=False)
+    arguments = shlex.split(command)
+    ended, shown = run(*arguments, *(["--json"] if arguments[0] == "inspect" else []))
+    if arguments[0] == "inspect":
+        assert ended == 0
+        found = {channel["name"]: channel["max"] for channel in json.loads(shown)["channels"]}
+        assert found == pytest.approx({channel: values.max() for channel, values in expected.items()}, rel=1e-6)
+        return
+    for channel, values in expected.items():
+        np.testing.assert_allclose(found[channel], values, rtol=1e-6, atol=1e-4 if name == "rounded times" else 1e-9)
 
 
 @pytest.mark.parametrize(

@@ -262,12 +262,12 @@ def _find_blocks(lines: Sequence[str]) -> Iterator[Rows]:
             if len(cells) == 3 and None not in numbers:
                 block.append([number for number in numbers if number is not None])
                 continue
-            if len(block) >= MINIMUM_POINTS and above != 3 and _is_swept(np.array(block)[:, 0]):
+            if len(block) >= MINIMUM_POINTS and above != 3 and is_swept(np.array(block)[:, 0]):
                 yield np.array(block)
             block, above = [], len(cells)
 
 
-def _is_swept(frequency: np.ndarray, min_ratio: float = 3.0) -> bool:
+def is_swept(frequency: np.ndarray, min_ratio: float = 3.0) -> bool:
     """Return whether positive numbers change by steps of very different size, as times do not."""
     steps = np.abs(np.diff(frequency))
     return bool(np.all(frequency > 0.0) and np.max(steps) > min_ratio * np.min(steps))
