@@ -24,9 +24,10 @@ from fitact.data.preview import preview
 from fitact.data.readers.capture import resolve_channels
 from fitact.data.readers.read import read_capture
 from fitact.data.readers.spectrum import is_spectrum
+from tests.layouts.layout import REAL, SCOPE
+from tests.layouts.records import ARRAY_WRITERS
+from tests.layouts.spectra import write_layouts
 
-SCOPE = Path(__file__).parent / "data" / "scope"
-REAL = Path(__file__).parents[2] / "shared" / "real"  # files of others' instruments, which are not shipped
 SECONDS = 10.0  # time limit for one file, s
 MEGABYTES = 1000.0  # limit on the rise of peak memory by one file, MB; a string of damaged length in HDF5 takes 800
 TOKENS = (
@@ -38,14 +39,10 @@ TOKENS = (
 
 def samples() -> dict[str, bytes]:
     """Return the files to damage: the shipped ones, and one of each kind with named arrays."""
-    from tests.data.test_scope_files import NAMED
-    from tests.data.test_spectrum import write_layouts
-
     found = {path.name: path.read_bytes() for path in sorted(SCOPE.iterdir()) if path.suffix != ".md"}
     with tempfile.TemporaryDirectory() as folder:
-        for name, write in NAMED.items():
-            write(Path(folder) / name)
-            found[name] = (Path(folder) / name).read_bytes()
+        arrays = [write(Path(folder)) for write in ARRAY_WRITERS]
+        found |= {path.name: path.read_bytes() for path in arrays}
         spectra = write_layouts(Path(folder))
         spectra += [path for kind in ("bode", "impedance_py", "pyimpspec") for path in sorted((REAL / kind).glob("*"))]
         found |= {f"spectrum {path.name}": path.read_bytes() for path in spectra}

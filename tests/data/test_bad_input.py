@@ -1,4 +1,4 @@
-"""Handling of each kind of bad input; docs/input.md lists the same kinds, and a test compares the two."""
+"""Handling of each kind of bad input; test_refusals.py reads the sentences of those that a reader refuses."""
 
 import functools
 import gzip
@@ -13,7 +13,6 @@ import pytest
 import fitact
 from tests.conftest import square_record
 
-PAGE = Path(__file__).parents[2] / "docs" / "input.md"
 PERIODS, PER_PERIOD = 20, 200
 Table = dict[str, np.ndarray]  # columns by name in the header
 
@@ -237,10 +236,3 @@ def test_a_good_record_is_not_doubted(tmp_path: Path):
     seen = fitact.inspect(path)
     assert (seen.notes, seen.warnings) == ((), ())
     assert seen.frequency == pytest.approx(100.0, rel=1e-3)
-
-
-def test_the_page_lists_the_same():
-    lists = re.findall(r"^- (refused|warned|read|fit refuses): (.+)\.$", PAGE.read_text("utf-8"), re.MULTILINE)
-    listed = {kind: verdict for verdict, kinds in lists for kind in kinds.split("; ")}
-    assert listed == {kind: verdict for kind, (verdict, *_) in KINDS.items()}
-    assert len(listed) >= 60

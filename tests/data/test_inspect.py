@@ -16,7 +16,7 @@ import scipy.io
 
 import fitact
 from fitact.cli import main
-from tests.data.test_scope_files import SCOPE
+from tests.layouts.layout import SCOPE
 
 
 @pytest.fixture

@@ -1,5 +1,6 @@
 """Files as other people's programs write them: each is read with the written values, or refused for its kind."""
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,106 +10,71 @@ import scipy.io
 
 import fitact
 from fitact.data.clipping import clipping_mask
+from fitact.data.readers.read import read_capture
+from tests.layouts.__main__ import PAGE, render_table
+from tests.layouts.layout import COUNT, REAL, SCOPE, TIME, VSC, Layout, V, rows
+from tests.layouts.records import LVM, PLAIN, RECORDS, clocks, with_clock
+from tests.layouts.spectra import FREQUENCY, GAIN, SHOWN, SPECTRA, Y, Z, write_gain, write_pair
 
-STEP, COUNT = 20e-6, 300
-TIME = STEP * np.arange(COUNT)
-V = 120.0 * np.sin(2.0 * np.pi * 330.0 * TIME) - 3.25
-VSC = 11.0 * np.cos(2.0 * np.pi * 330.0 * TIME) + 0.5
-
-
-def rows(*columns: np.ndarray, form: str = "%.5f", delimiter: str = ",") -> list[str]:
-    return [delimiter.join(form % x for x in row) for row in zip(*columns, strict=True)]
-
-
-def clocks(form: str = "{h:02d}:{m:02d}:{s:09.6f}", begin: float = 86_399.999) -> list[str]:
-    """Return times of day that pass midnight."""
-    since = (begin + TIME) % 86_400.0
-    return [form.format(h=int(t // 3600), m=int(t % 3600 // 60), s=t % 60.0) for t in since]
+EXTRAS = {"scope": "RigolWFM.wfm", "tdms": "nptdms"}  # modules that `fitact[...]` installs
+MADE = [
+    pytest.param(layout, id=f"{layout.program}{layout.ending}")
+    for layout in (*RECORDS, *SPECTRA)
+    if layout.write is not None
+]
 
 
-def with_clock(header: str, clock: list[str], **how: str) -> str:
-    lines = zip(clock, rows(V, VSC, **how), strict=True)
-    return "\n".join([header, *(f"{time}{how.get('delimiter', ',')}{row}" for time, row in lines), ""])
-
-
-def half_past(clock: list[str]) -> list[str]:
-    return [f"{int(c[:2]) % 12 or 12}{c[2:]} {'AM' if int(c[:2]) < 12 else 'PM'}" for c in clock]
-
-
-def thousands(x: float) -> str:
-    return f'"{x:,.3f}"'
-
-
-YOKOGAWA = (
-    '"Model Name","DL850"\n"TraceName","CH1","CH2"\n"BlockSize",300,300\n"VUnit","V","V"\n"SampleRate",50000,50000\n'
-    '"HResolution",2.0E-05,2.0E-05\n"HOffset",0.0,0.0\n"DisplayBlockSize",300,300\n"Date","2025/03/04","2025/03/04"\n'
-    '"Time","09:15:59.990","09:15:59.990"\n\n'
-)
-LVM = (
-    "LabVIEW Measurement\nX_Columns\tOne\nChannels\t2\nSamples\t300\t300\nY_Unit_Label\tVolts\tVolts\n"
-    "X_Dimension\tTime\tTime\nX0\t0.0\t0.0\nDelta_X\t0.000020\t0.000020\n***End_of_Header***\t\t\t\n"
-    "X_Value\tV\tVsc\tComment\n"
-)
-LAYOUTS: dict[str, tuple[str, dict[str, object]]] = {
-    "time stamps": (with_clock(",V_V,Vsc_V", [f"2025-03-04 {c}" for c in clocks()]), {}),
-    "ISO time stamps with a zone": (with_clock("when,V_V,Vsc_V", [f"2025-03-04T{c}+01:00" for c in clocks()]), {}),
-    "a date and a clock": (with_clock("Date,Time,V (V),Vsc (V)", [f"04/03/2025,{c}" for c in clocks()]), {}),
-    "a twelve-hour clock": (with_clock("Time,V_V,Vsc_V", half_past(clocks())), {}),
-    "a German clock": (
-        with_clock("Zeit;V_V;Vsc_V", clocks(), delimiter=";").replace(".", ","), {},
-    ),
-    "a coarse clock and a rate": (
-        with_clock("Time,V_V,Vsc_V", [c[:8] for c in clocks(begin=100.0)]), {"rate": 1.0 / STEP},
-    ),
-    "no time and a rate": ("\n".join(["V_V,Vsc_V", *rows(V, VSC)]), {"rate": 1.0 / STEP}),
-    "no names and a rate": (
-        "\n".join(rows(V, VSC)), {"rate": 1.0 / STEP, "channels": {"V": "1", "Vsc": "2"}},
-    ),
-    "thousands in quotes": (
-        "\n".join(
-            ['"Time (us)","V (mV)","Vsc (mV)"']
-            + [",".join(map(thousands, row)) for row in zip(1e6 * TIME, 1e3 * V, 1e3 * VSC, strict=True)]
-        ),
-        {},
-    ),
-    "typographic minus": (
-        "\n".join(["time_s,V_V,Vsc_V", *rows(TIME, V, VSC)]).replace(",-", ",\N{MINUS SIGN}"), {},
-    ),
-    "statistics below": ("\n".join(["time_s,V_V,Vsc_V", *rows(TIME, V, VSC), "Mean,0.1,0.2", "RMS,1,2", ""]), {}),
-    "padding at the end": ("\n".join(["time_s,V_V,Vsc_V", *rows(TIME, V, VSC)]) + "\n\x1a\x00\x00", {}),
-    "wrdata of ngspice": (
-        "\n".join(rows(TIME, V, TIME, VSC, form=" %.8e", delimiter=" ")), {"channels": {"V": "2", "Vsc": "column 4"}},
-    ),
-    "LabVIEW with times": (LVM + "\n".join(rows(TIME, V, VSC, delimiter="\t")), {}),
-    "LabVIEW without times": (
-        LVM.replace("One", "No") + "\n".join("\t" + row for row in rows(V, VSC, delimiter="\t")), {},
-    ),
-    "Yokogawa": (
-        YOKOGAWA + "\n".join("," + row for row in rows(V, VSC)), {"channels": {"V": "CH1", "Vsc": "CH2"}},
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_values_are_those_that_were_written(layout: str, tmp_path: Path):
-    text, how = LAYOUTS[layout]
-    path = tmp_path / "record.csv"
-    path.write_text(text, encoding="utf-8", newline="\n")
-    record = fitact.read(path, **how)
+@pytest.mark.parametrize("layout", MADE)
+def test_values_are_those_that_were_written(layout: Layout, tmp_path: Path, monkeypatch):
+    if layout.extra:
+        pytest.importorskip(EXTRAS[layout.extra])
+    path = layout.write(tmp_path)
+    if layout.kind == "spectrum":
+        spectrum = fitact.read_spectrum(path)
+        assert spectrum.channel == ("impedance" if layout.taken == "impedance" else "Vsc")
+        np.testing.assert_allclose(spectrum.frequency, FREQUENCY, rtol=1e-8)
+        np.testing.assert_allclose(spectrum.values, Z if layout.taken == "impedance" else GAIN, rtol=1e-7)
+        return
+    if layout.options:
+        with pytest.raises(fitact.InputError):  # it needs them
+            fitact.read(path)
+    record = fitact.read(path, **layout.options)
     np.testing.assert_allclose(record.time - record.time[0], TIME, atol=1e-8)
-    np.testing.assert_allclose(record["V"], V, atol=6e-5)
-    np.testing.assert_allclose(record["Vsc"], VSC, atol=6e-5)
-    assert fitact.inspect(path, **how).time.size == COUNT
+    np.testing.assert_allclose(record["V"], V, atol=6e-6 + layout.resolution * np.max(np.abs(V)))
+    np.testing.assert_allclose(record["Vsc"], VSC, atol=6e-6 + layout.resolution * np.max(np.abs(VSC)))
+    inspection = fitact.inspect(path, **layout.options)
+    assert inspection.time.size == COUNT
+    # what the table says is taken from the file is taken: nothing of it was assumed
+    channels = inspection.columns if layout.kind != "sound" else ()
+    assert "units" not in layout.taken or all(channel.unit == "V" for channel in channels)
+    assert "attenuation" not in layout.taken or inspection.columns[0].attenuation == 10.0
+    if layout.extra:
+        monkeypatch.setitem(sys.modules, EXTRAS[layout.extra], None)
+        with pytest.raises(fitact.InputError, match=rf"pip install 'fitact\[{layout.extra}\]'"):
+            fitact.read(path, **layout.options)
 
 
-def test_hantek_writes_one_channel_with_its_clock_in_the_header(tmp_path: Path):
-    for name, values in (("a", V), ("b", VSC)):
-        head = f"#CHANNEL:CH1\n#CLOCK=20.000uS\n#SIZE={COUNT}\n#UNITS:V\n"
-        (tmp_path / f"{name}.csv").write_text(head + "\n".join(rows(values)))
-    record = fitact.read(tmp_path / "a.csv", channels={"V": "CH1", "Vsc": "b.csv:CH1"})
-    np.testing.assert_allclose(record.time, TIME, atol=1e-12)
-    np.testing.assert_allclose(record["V"], V, atol=6e-6)
-    np.testing.assert_allclose(record["Vsc"], VSC, atol=6e-6)
+REAL_FILES = [pytest.param(layout, name, id=name) for layout in (*RECORDS, *SPECTRA) for name in layout.real]
+
+
+@pytest.mark.parametrize(("layout", "name"), REAL_FILES)
+def test_real_files_are_read(layout: Layout, name: str, tmp_path: Path):
+    """Test that they are read; the values are compared in the tests of each."""
+    if layout.extra:
+        pytest.importorskip(EXTRAS[layout.extra])
+    found = [folder / name for folder in (SCOPE, REAL) if (folder / name).exists()]
+    if not found:
+        pytest.skip(f"{name} is another's and not shipped")
+    if layout.kind == "spectrum":
+        assert min(map(len, fitact.read_spectra(found[0]))) > 20
+        return
+    capture = read_capture(found[0], rate=None if name != "rs_rtp_01.Wfm.csv" else 1e9)
+    assert capture.time.size == capture.channels[0].values.size
+    assert np.all(np.diff(capture.time) > 0.0)
+
+
+def test_the_page_holds_the_table():
+    assert render_table() in PAGE.read_text("utf-8"), "write it again: python -m tests.layouts"
 
 
 @pytest.mark.parametrize("kind", [np.int16, np.int32, np.uint8, np.float32])
@@ -127,10 +93,12 @@ def test_sound_files_need_their_full_scale(kind: type, tmp_path: Path):
 
 def test_what_was_left_out_is_noted(tmp_path: Path):
     path = tmp_path / "record.csv"
-    path.write_text(LAYOUTS["statistics below"][0])
+    path.write_text(PLAIN + "Mean,0.1,0.2\nRMS,1,2\n")
     assert any("2 lines of words below the data were left out (Mean, RMS)" in note for note in fitact.read(path).notes)
-    path.write_text(LAYOUTS["time stamps"][0])
+    path.write_text(with_clock(",V_V,Vsc_V", clocks()))
     assert any("counted from the first" in note for note in fitact.read(path).notes)
+    spectrum = fitact.read_spectrum(write_gain("ltspice.txt", tmp_path))
+    assert any("source of 1 V" in note for note in spectrum.notes)
 
 
 def insert(line: str) -> Callable[[list[str]], list[str]]:
@@ -164,29 +132,8 @@ REFUSED = {  # lines, and words of the sentence; see test_refusals.py
 }  # fmt: skip
 
 
-FREQUENCY = np.geomspace(20.0, 1e5, 40)
-OMEGA = 2.0 * np.pi * FREQUENCY
-Z = 1.0 / (1.0 / 160e3 + 1j * OMEGA * 22e-9) + 800.0 - 1j / (OMEGA * 1.35e-9)
-Y = 1.0 / Z
-# what an LCR meter shows, by its handbook: series and parallel equivalents of an impedance
-SHOWN = {
-    "Cp": Y.imag / OMEGA, "Cs": -1.0 / (OMEGA * Z.imag), "Lp": -1.0 / (OMEGA * Y.imag), "Ls": Z.imag / OMEGA,
-    "Rp": 1.0 / Y.real, "Rs": Z.real, "G": Y.real, "B": Y.imag, "D": Z.real / abs(Z.imag), "Q": abs(Z.imag) / Z.real,
-}  # fmt: skip
-PAIRS = [
-    *((c, other) for c in ("Cp", "Cs") for other in ("D", "Q")), ("Cp", "G"), ("Cp", "Rp"), ("Cs", "Rs"), ("Ls", "Rs"),
-    ("Lp", "Rp"), ("Lp", "G"), ("G", "B"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("first", "second"), PAIRS)
-def test_pairs_of_an_LCR_meter_are_impedances(first: str, second: str, tmp_path: Path):
-    path = tmp_path / "meter.csv"
-    lines = rows(FREQUENCY, SHOWN[first], SHOWN[second], form="%.9e")
-    path.write_text("\n".join([f"Frequency,{first},{second}", *lines]))
-    spectrum = fitact.read_spectrum(path)
-    np.testing.assert_allclose(spectrum.values, Z, rtol=1e-7)
-    assert f"the impedance follows from {first} and {second}" in spectrum.notes
+def test_the_convention_of_a_pair_is_noted(tmp_path: Path):
+    assert "the impedance follows from Cp and D" in fitact.read_spectrum(write_pair("Cp", "D", tmp_path)).notes
 
 
 def test_units_and_other_words_of_an_LCR_meter(tmp_path: Path):
@@ -206,23 +153,6 @@ def test_units_and_other_words_of_an_LCR_meter(tmp_path: Path):
     degrees = np.degrees(np.angle(Y))
     path.write_text("\n".join(["f (Hz),|Y| (uS),theta (deg)", *rows(FREQUENCY, 1e6 * np.abs(Y), degrees, form="%.9e")]))
     np.testing.assert_allclose(fitact.read_spectrum(path).values, Z, rtol=1e-7)
-
-
-@pytest.mark.parametrize("form", ["polar", "parts"])
-def test_an_AC_analysis_of_LTspice_is_a_gain(form: str, tmp_path: Path):
-    gain = 160e3 / (1.0 + 1j * OMEGA * 3.5e-3) / Z
-    decibels, degrees = 20.0 * np.log10(np.abs(gain)), np.degrees(np.angle(gain))
-    cells = [f"({a:.15e}dB,{b:.15e}\N{DEGREE SIGN})" for a, b in zip(decibels, degrees, strict=True)]
-    if form == "parts":
-        cells = [f"{x.real:.15e},{x.imag:.15e}" for x in gain]
-    lines = ["Freq.\tV(skin)", *(f"{f:.15e}\t{cell}" for f, cell in zip(FREQUENCY, cells, strict=True))]
-    path = tmp_path / "ac.txt"
-    path.write_text("\n".join(lines), encoding="latin-1")
-    spectrum = fitact.read_spectrum(path)
-    assert spectrum.channel == "Vsc"
-    np.testing.assert_allclose(spectrum.frequency, FREQUENCY, rtol=1e-12)
-    np.testing.assert_allclose(spectrum.values, gain, rtol=1e-9)
-    assert any("source of 1 V" in note for note in spectrum.notes)
 
 
 @pytest.mark.parametrize("code", ["9.9e37", "\N{INFINITY}"])

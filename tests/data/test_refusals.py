@@ -23,12 +23,13 @@ from fitact.data.readers import binary, capture, header, layouts, matlab, read, 
 from fitact.data.readers import spectrum as spectrum_files
 from tests.data.test_bad_input import KINDS, make_file
 from tests.data.test_layouts import REFUSED as REFUSED_LAYOUTS
-from tests.data.test_layouts import TIME as TIMES
-from tests.data.test_layouts import VSC, V, rows
-from tests.data.test_scope_files import NAMED, SCOPE, SKIN, TIME, WAVES
-from tests.data.test_spectrum import BROKEN, FILES, FREQUENCY, TRUTH, impedance
+from tests.data.test_scope_files import SKIN
+from tests.data.test_spectrum import BROKEN
 from tests.data.test_spectrum import broken as write_broken
-from tests.data.test_spectrum import write as write_spectrum
+from tests.layouts.layout import SCOPE, TIME, VSC, V, rows
+from tests.layouts.records import ARRAYS, PLAIN, write_mat, write_tdms, write_wav
+from tests.layouts.spectra import FILES, FREQUENCY, Z
+from tests.layouts.spectra import write as write_spectrum
 
 READERS = (
     binary, capture, header, layouts, matlab, read, stream, text, spectrum_files, record, spectrum, inspection,
@@ -88,15 +89,15 @@ def npz(**arrays: Any) -> Callable[[Path], Path]:
     return write
 
 
-def named(name: str, size: float) -> Callable[[Path], Path]:
-    """Return the writer of the first part of a file with named arrays."""
+def cut(write: Callable[[Path], Path], size: float) -> Callable[[Path], Path]:
+    """Return the writer of the first part of a file."""
 
-    def write(folder: Path) -> Path:
-        NAMED[name](folder / name)
-        content = (folder / name).read_bytes()
-        return put(content[: int(size * len(content))], name)(folder)
+    def write_part(folder: Path) -> Path:
+        path = write(folder)
+        path.write_bytes(path.read_bytes()[: int(size * path.stat().st_size)])
+        return path
 
-    return write
+    return write_part
 
 
 def write_iq(folder: Path) -> Path:
@@ -121,7 +122,7 @@ def write_huge_hdf5(folder: Path) -> Path:
 def write_two_rates(folder: Path) -> Path:
     nptdms = pytest.importorskip("nptdms")
     with nptdms.TdmsWriter(str(folder / "a.tdms")) as file:
-        for step, (name, values) in zip((1e-5, 2e-5), WAVES.items(), strict=True):
+        for step, (name, values) in zip((1e-5, 2e-5), ARRAYS.items(), strict=True):
             file.write_segment(
                 [nptdms.ChannelObject("scope", name, values, {"wf_increment": step, "wf_start_offset": 0.0})]
             )
@@ -130,12 +131,12 @@ def write_two_rates(folder: Path) -> Path:
 
 def write_two_files(folder: Path) -> Path:
     for name, count in (("C1.csv", 300), ("C2.csv", 299)):
-        put("\n".join(["Time,Ampl", *rows(TIMES[:count], V[:count])]), name)(folder)
+        put("\n".join(["Time,Ampl", *rows(TIME[:count], V[:count])]), name)(folder)
     return folder / "C1.csv"
 
 
 def sweep(scale: complex = 1.0) -> Callable[[Path], Path]:
-    return lambda folder: write_spectrum(folder / "z.csv", *FILES["plain.csv"], scale * impedance(FREQUENCY, **TRUTH))
+    return lambda folder: write_spectrum(folder / "z.csv", *FILES["plain.csv"], scale * Z)
 
 
 def from_arrays(path: Path, **channels: np.ndarray) -> fitact.Record:
@@ -154,7 +155,6 @@ def raise_an_error(*_: object) -> Any:
     raise OSError("the disk is gone")
 
 
-GOOD = "\n".join(["time_s,V_V,Vsc_V", *rows(TIMES, V, VSC)]) + "\n"
 NO_CHANNELS = types.SimpleNamespace(Wfm=types.SimpleNamespace(from_file=lambda _: types.SimpleNamespace(channels=[])))
 KEYSIGHT = scope("keysight_scope_0.csv")
 REFUSALS: dict[str, Refusal] = {
@@ -181,15 +181,15 @@ REFUSALS: dict[str, Refusal] = {
     ),
     "invalid file, real": Refusal(scope("tek_invalid_csv.csv"), "no column time_s"),
     "invalid length, real": Refusal(scope("tek_invalid_record_length.csv"), "no column time_s"),
-    "time alone": Refusal(put("\n".join(["time_s", *rows(TIMES)])), "the only column of numbers is the time"),
+    "time alone": Refusal(put("\n".join(["time_s", *rows(TIME)])), "the only column of numbers is the time"),
     "packed binary": Refusal(put(gzip.compress(bytes(range(256)) * 50)), "neither a text file"),
-    "endless line": Refusal(put(GOOD + "1" * 9_000_000), "has a line of 9,000,000 bytes"),
+    "endless line": Refusal(put(PLAIN + "1" * 9_000_000), "has a line of 9,000,000 bytes"),
     "text without end": Refusal(
-        put(GOOD), "of uncompressed text",
+        put(PLAIN), "of uncompressed text",
         call=lambda path: text.read_text(path, str(path), lambda names, _: names, max_bytes=99),
     ),
     "disk that is gone": Refusal(
-        put(GOOD), "cannot be read", call=lambda path: list(stream.stream_record(path)),
+        put(PLAIN), "cannot be read", call=lambda path: list(stream.stream_record(path)),
         patched=(stream, "_chunks", raise_an_error),
     ),
     # the assignment of columns
@@ -205,14 +205,14 @@ REFUSALS: dict[str, Refusal] = {
     "files of two acquisitions": Refusal(
         write_two_files, "same acquisition", {"channels": {"Vsc": "Ampl", "V": "C2.csv:Ampl"}}
     ),
-    "negative rate": Refusal(put(GOOD), "is no sampling rate", {"rate": -1.0}),
-    "rate that is no number": Refusal(put(GOOD), "is no sampling rate", {"rate": np.nan}),
+    "negative rate": Refusal(put(PLAIN), "is no sampling rate", {"rate": -1.0}),
+    "rate that is no number": Refusal(put(PLAIN), "is no sampling rate", {"rate": np.nan}),
     "rounded times without names": Refusal(
-        put("\n".join(["time_s,a,b", *rows(TIMES, V, VSC, form="%.3f")])), "times are not increasing",
+        put("\n".join(["time_s,a,b", *rows(TIME, V, VSC, form="%.3f")])), "times are not increasing",
         call=fitact.inspect,
     ),
     "sound without its full scale": Refusal(
-        lambda folder: write_sound(folder, np.float32), r"give the full scale, for 10 V as --scale V=10",
+        write_wav, r"give the full scale, for 10 V as --scale V=10",
         {"channels": {"V": "1", "Vsc": "2"}},
     ),
     # binary files and arrays
@@ -230,11 +230,11 @@ REFUSALS: dict[str, Refusal] = {
     "no channel": Refusal(
         scope("agilent_1.bin"), "no analogue channel", patched=(sys.modules, "RigolWFM.wfm", NO_CHANNELS)
     ),
-    "cut TDMS": Refusal(named("g.tdms", 0.7), "truncated or damaged"),
+    "cut TDMS": Refusal(cut(write_tdms, 0.7), "truncated or damaged"),
     "two sampling rates": Refusal(
         write_two_rates, "different times than 'drive'", {"channels": {"V": "drive", "Vsc": "skin"}}
     ),
-    "cut MATLAB": Refusal(named("a.mat", 0.7), "cannot be read"),
+    "cut MATLAB": Refusal(cut(write_mat, 0.7), "cannot be read"),
     "another zip": Refusal(write_zip, "is a zip archive"),
     "complex numbers": Refusal(write_iq, "complex"),
     "counts": Refusal(npz(XInc=1e-6, YInc=0.01, Vsc=np.arange(50)), "ADC counts"),
@@ -242,11 +242,11 @@ REFUSALS: dict[str, Refusal] = {
     "arrays without channels": Refusal(npz(time=TIME), "no one-dimensional array except the time"),
     "huge array": Refusal(write_huge_hdf5, "more than the file can hold"),
     # arrays of a program, in place of a file
-    "no channel given": Refusal(put(GOOD), "no channel was given", call=from_arrays),
-    "shapes": Refusal(put(GOOD), "has shape", {"Vsc": TIME[1:]}, from_arrays),
+    "no channel given": Refusal(put(PLAIN), "no channel was given", call=from_arrays),
+    "shapes": Refusal(put(PLAIN), "has shape", {"Vsc": TIME[1:]}, from_arrays),
     # spectra
     "spectrum in place of a record": Refusal(sweep(), "is a spectrum, without time"),
-    "record in place of a spectrum": Refusal(put(GOOD), "no line names a frequency", call=fitact.read_spectrum),
+    "record in place of a spectrum": Refusal(put(PLAIN), "no line names a frequency", call=fitact.read_spectrum),
     "two spectra": Refusal(
         lambda folder: write_two_sweeps(folder), "holds 2 spectra; choose one", call=fitact.read_spectrum
     ),
@@ -261,11 +261,6 @@ REFUSALS: dict[str, Refusal] = {
         sweep(), "holds the frequency 0 Hz", {"frequency": np.arange(9.0), "values": np.ones(9)}, spectrum_from_arrays
     ),
 }  # fmt: skip
-
-
-def write_sound(folder: Path, kind: type) -> Path:
-    scipy.io.wavfile.write(folder / "card.wav", 50_000, np.column_stack([V / 200.0, VSC / 20.0]).astype(kind))
-    return folder / "card.wav"
 
 
 def write_two_sweeps(folder: Path) -> Path:

@@ -10,8 +10,8 @@ import pytest
 import fitact
 from fitact.data.readers.matlab import read_mat
 from fitact.data.readers.read import read_capture
+from tests.layouts.layout import SCOPE, STEP, TIME, VSC, V
 
-SCOPE = Path(__file__).parents[1] / "data" / "scope"
 SKIN = {"V": "CH1", "Vsc": "CH2"}
 
 # file: manufacturer, names, samples, first time, step, first and last value of the last channel (from a text editor)
@@ -44,62 +44,6 @@ def test_what_the_header_says_of_probes():
     attenuation = [t.attenuation for t in read_capture(SCOPE / "rigol_DS1052E.csv.gz").channels]
     assert attenuation == [10.0, 1.0]
     assert read_capture(SCOPE / "tek_TDS2000_F0000CH1.CSV").channels[0].attenuation == 100.0
-
-
-CHS = [("CH1", "V", 1.0), ("CH2", "V", 1.0)]
-TWO = [("1", "V", 1.0), ("2", "V", 1.0)]
-# layouts that public parsers document: header, row, and the name, unit and factor of each channel
-LAYOUTS = {
-    "Tektronix": (
-        "Model,MSO58\nFirmware Version,2.0.3\n\nWaveform Type,ANALOG,ANALOG\nPoint Format,Y,Y\nHorizontal Units,s,s\n"
-        "Sample Interval,1e-06,1e-06\nRecord Length,40,40\nVertical Units,V,A\nProbe Attenuation,10,1\n"
-        "Label,SDA,IOUT\n,,\nTIME,CH1,CH2,\n",
-        "{t},{a},{b},",
-        [("CH1", "V", 1.0), ("CH2", "A", 1.0)],
-    ),
-    "Keysight": ("x-axis,1,2\nsecond,Volt,Volt\n-2e-3,,\n-1.5e-3,,\n", "{t},{a},{b}", TWO),
-    "Rigol": (",CH1,CH2,\nSecond,Volt,Volt,\n", "{t},{a},{b},", CHS),
-    "Siglent": (
-        "Record Length,40,\nSample Interval,Analog:1e-6\nVertical Units,CH1:V CH2:V,,\n"
-        "Vertical Scale,CH1:0.05 CH2:0.1,,\nHorizontal Units,s,,\nModel Number,SDS1202CL+,,\n\nSource,CH1,CH2\n"
-        "Second,Volt,Volt\n",
-        "{t},{a},{b}", CHS,
-    ),
-    "LeCroy": (
-        "LECROYWaveRunner\x92R,21153,Waveform\nSegments,1,SegmentSize,40\nSegment,TrigTime,TimeSinceSegment1\n"
-        "#1,16-Mar-2022 14:45:39,0                 \nTime,Ampl1, Ampl2\n",
-        "{t},{a},{b}", [("Ampl1", "", 1.0), ("Ampl2", "", 1.0)],
-    ),
-    "PicoScope": (
-        "Zeit;Kanal A;Kanal B\n(ms);(V);(mV)\n\n", "{ms};{a};{b}", [("Kanal A", "V", 1.0), ("Kanal B", "V", 1e-3)],
-    ),
-    "Saleae": (
-        "Time [s],Channel 0,Channel 1\n", "{t},{a},{b}", [("Channel 0", "", 1.0), ("Channel 1", "", 1.0)],
-    ),
-    "Rohde & Schwarz": ("in s,C1 in V,C2 in mV\n", "{t},{a},{b}", [("C1", "V", 1.0), ("C2", "V", 1e-3)]),
-    "text": (
-        '"Time / us","drive (kV)",note,"Vsc / mV"\n', "{us},{a},ok,{b}", [("drive", "V", 1e3), ("Vsc", "V", 1e-3)],
-    ),
-    "fitact": ("# time_s V_V Vsc_V\n", "{t} {a} {b}", [("V", "V", 1.0), ("Vsc", "V", 1.0)]),  # layout of numpy.savetxt
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("maker", LAYOUTS)
-def test_documented_layouts(tmp_path: Path, maker: str):
-    header, row, expected = LAYOUTS[maker]
-    path = tmp_path / "record.csv"
-    lines = [
-        row.format(t=f"{i - 5}e-6", ms=f"{(i - 5) * 1e-3:.3f}", us=i - 5, a=i % 7 / 4, b=i % 5 / 8) for i in range(40)
-    ]
-    text = "\n".join(lines)
-    path.write_bytes((header + (text.replace(".", ",") if ";" in row else text)).encode("latin-1"))
-    capture = read_capture(path)
-    assert capture.format == maker
-    np.testing.assert_allclose(capture.time, 1e-6 * (np.arange(40) - 5), atol=1e-15)
-    assert [(trace.name, trace.unit) for trace in capture.channels] == [(name, unit) for name, unit, _ in expected]
-    waves = np.arange(40) % 7 / 4, np.arange(40) % 5 / 8
-    for trace, wave, (_, _, factor) in zip(capture.channels, waves, expected, strict=True):
-        np.testing.assert_allclose(trace.values, factor * wave, rtol=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -181,6 +125,16 @@ def test_keysight_and_rigol_binary_against_their_floats():
 
 
 @pytest.mark.usefixtures("rigolwfm")
+def test_tektronix_binary_against_its_counts():
+    """Layout WFM#003: the volts of a count at byte 168, and counts of 16 bits from the byte that is stated at 16."""
+    content = (SCOPE / "tek_golden_analog.wfm").read_bytes()
+    (step,), (begin,) = struct.unpack_from("<d", content, 168), struct.unpack_from("<i", content, 16)
+    capture = read_capture(SCOPE / "tek_golden_analog.wfm")
+    np.testing.assert_allclose(capture.channels[0].values, step * np.frombuffer(content, "<i2", 6, begin), rtol=1e-6)
+    np.testing.assert_array_equal(capture.time, np.arange(-3.0, 3.0))
+
+
+@pytest.mark.usefixtures("rigolwfm")
 def test_lecroy_binary_against_its_descriptor():
     """LeCroy's template: lengths of the blocks at 36, gain at 156, offset at 160, interval at 176, start at 180."""
     content = (SCOPE / "lecroy_3.trc").read_bytes()
@@ -211,75 +165,6 @@ def test_rigol_binary_against_the_csv_of_the_same_capture():
 # ---- arrays with names
 
 
-TIME = np.arange(100) * 1e-5 - 1e-4
-WAVES = {"drive": np.sin(2e3 * np.pi * TIME), "skin": 0.1 * np.cos(2e3 * np.pi * TIME)}
-
-
-def write_mat(path: Path) -> None:
-    import scipy.io
-
-    scipy.io.savemat(path, {"Tstart": TIME[0], "Tinterval": 1e-5, **WAVES})  # layout of PicoScope
-
-
-def write_mat_73(path: Path) -> None:
-    import h5py
-
-    with h5py.File(path, "w", userblock_size=512) as file:
-        for name, values in {"time": TIME, **WAVES}.items():
-            file[name] = values[None, :]
-    with path.open("r+b") as file:
-        file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
-
-
-def write_hdf5(path: Path) -> None:
-    import h5py
-
-    with h5py.File(path, "w") as file:
-        for name, values in {"time": 1e3 * TIME, **WAVES}.items():
-            file[f"scope/{name}"] = values
-            file[f"scope/{name}"].attrs["units"] = "ms" if name == "time" else "V"
-
-
-def write_netcdf(path: Path) -> None:
-    import xarray
-
-    xarray.Dataset({n: ("time", v, {"units": "V"}) for n, v in WAVES.items()}, {"time": TIME}).to_netcdf(
-        path, engine="h5netcdf"
-    )
-
-
-def write_netcdf3(path: Path) -> None:
-    import xarray
-
-    xarray.Dataset({n: ("time", v) for n, v in WAVES.items()}, {"time": TIME}).to_netcdf(path, engine="scipy")
-
-
-def write_npz(path: Path) -> None:
-    np.savez(path, t=TIME, **WAVES)
-
-
-def write_tdms(path: Path) -> None:
-    nptdms = pytest.importorskip("nptdms")
-    timing = {"wf_increment": 1e-5, "wf_start_offset": TIME[0], "unit_string": "V"}
-    with nptdms.TdmsWriter(str(path)) as file:
-        file.write_segment([nptdms.ChannelObject("scope", name, values, timing) for name, values in WAVES.items()])
-
-
-NAMED = {
-    "a.mat": write_mat, "b.mat": write_mat_73, "c.h5": write_hdf5, "d.nc": write_netcdf, "e.nc": write_netcdf3,
-    "f.npz": write_npz, "g.tdms": write_tdms,
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", NAMED)
-def test_files_of_named_arrays(tmp_path: Path, name: str):
-    NAMED[name](tmp_path / name)
-    record = fitact.read(tmp_path / name, channels={"V": "drive", "Vsc": "skin"}, scale={"Vsc": 10.0})
-    np.testing.assert_allclose(record.time, TIME, atol=1e-15)
-    np.testing.assert_allclose(record["V"], WAVES["drive"], atol=1e-15)
-    np.testing.assert_allclose(record["Vsc"], 10.0 * WAVES["skin"], atol=1e-15)
-
-
 @pytest.mark.parametrize("compressed", [False, True])
 def test_matlab_against_what_scipy_wrote(tmp_path: Path, compressed: bool):
     import scipy.io
@@ -308,9 +193,9 @@ def test_arrays_are_named_as_columns_are(tmp_path: Path):
 
 
 def test_a_rate_gives_the_times_of_arrays_without(tmp_path: Path):
-    np.savez(tmp_path / "record.npz", V=WAVES["drive"], Vsc=WAVES["skin"])
-    record = fitact.read(tmp_path / "record.npz", rate=1e5)
-    np.testing.assert_allclose(record.time, TIME - TIME[0], atol=1e-15)
+    np.savez(tmp_path / "record.npz", V=V, Vsc=VSC)
+    record = fitact.read(tmp_path / "record.npz", rate=1.0 / STEP)
+    np.testing.assert_allclose(record.time, TIME, atol=1e-15)
     assert any("start at 0" in note for note in record.notes)
 
 
@@ -352,7 +237,7 @@ def test_a_current_from_the_voltage_over_a_resistor():
 
 def test_a_factor_replaces_an_unknown_unit(tmp_path: Path):
     path = tmp_path / "record.csv"
-    np.savetxt(path, np.column_stack([TIME, *WAVES.values()]), "%.17g", ",", header="time_s,V_V,I_div", comments="")
+    np.savetxt(path, np.column_stack([TIME, V, VSC]), "%.17g", ",", header="time_s,V_V,I_div", comments="")
     record = fitact.read(path, fitact.Scene(measurement={"channels": ["I"]}), scale={"I": 1e-3})
-    np.testing.assert_array_equal(record["I"], 1e-3 * WAVES["skin"])
+    np.testing.assert_array_equal(record["I"], 1e-3 * VSC)
     assert any("(unit div), multiplied by 0.001" in note for note in record.notes)

@@ -1,7 +1,6 @@
 """Files of spectra: layouts of analysers and of frequency-response analysers, real ones too, and what is refused."""
 
 import json
-import math
 from pathlib import Path
 
 import numpy as np
@@ -11,101 +10,8 @@ import fitact
 from fitact.cli import app
 from fitact.data.kramers_kronig import check_kramers_kronig
 from fitact.data.readers.spectrum import is_spectrum
-
-FREQUENCY = np.geomspace(1.0, 1e5, 41)
-TRUTH = {"Rsc": 130e3, "Csc": 18e-9, "Ci": 1.4e-9}
-
-
-def impedance(frequency: np.ndarray, Rsc: float, Csc: float, Ci: float, alpha: float = 1.0) -> np.ndarray:
-    """Return the impedance of two layers in series with the insulator; for alpha < 1 the layers are Cole elements."""
-    s = 2j * np.pi * frequency
-    return 2.0 * Rsc / (1.0 + (s * Rsc * Csc) ** alpha) + 1.0 / (s * Ci)
-
-
-FILES = {
-    "plain.csv": ("frequency_Hz,Z_real_ohm,Z_imag_ohm", "{f:.9g},{re:.9g},{im:.9g}"),
-    "bare.csv": (None, "{f:.9g},{re:.9g},{im:.9g}"),
-    "negative.csv": ("freq/Hz,Re(Z)/Ohm,-Im(Z)/Ohm", "{f:.9g},{re:.9g},{minus:.9g}"),
-    "polar.csv": ("Frequency (kHz);|Z| (kOhm);Phase (deg)", "{kf};{kz};{deg}"),
-    "gamry.DTA": (
-        "EXPLAIN\nTAG\tEISPOT\nZCURVE\tTABLE\n\tPt\tTime\tFreq\tZreal\tZimag\tZsig\tZmod\tZphz\tIdc\tVdc\tIERange"
-        "\n\t#\ts\tHz\tohm\tohm\tV\tohm\t°\tA\tV\t#",
-        "\t{n}\t1\t{f:.9g}\t{re:.9g}\t{im:.9g}\t1\t{size:.9g}\t{deg_point}\t0\t0\t5",
-    ),
-    "biologic.mpt": (
-        "EC-Lab ASCII FILE\nNb header lines : 5\n\nDevice : SP-300\n"
-        "freq/Hz\tRe(Z)/Ohm\t-Im(Z)/Ohm\t|Z|/Ohm\tPhase(Z)/deg\ttime/s",
-        "{f:.9g}\t{re:.9g}\t{minus:.9g}\t{size:.9g}\t{deg_point}\t1",
-    ),
-    "autolab.txt": (
-        "Index,Frequency (Hz),Z' (Ω),-Z'' (Ω),Z (Ω),-Phase (°)",
-        "{n},{f:.9g},{re:.9g},{minus:.9g},{size:.9g},1",
-    ),
-    "zplot.z": (
-        '"ZPLOT2 ASCII","2.2"\n"Comment"\n  Freq(Hz)     Ampl  Bias  Time(Sec)   Z\'(a)   Z\'\'(b)  GD Err Range'
-        "\nEnd Comments",
-        "{f:.9g}, 0.1, 0, 1, {re:.9g}, {im:.9g}, 0, 0, 4",
-    ),
-    "versastudio.par": (
-        "<Segment1>\nType=2\nDefinition=Segment #, Point #, E(V), I(A), Frequency(Hz), E Real, E Imag, I Real, I Imag,"
-        " Z Real, Z Imag",
-        "0,{n},0,0,{f:.9g},0,0,0,0,{re:.9g},{im:.9g}",
-    ),
-    "quoted.z": (
-        '"ZPlotW Data File: Version 3.2c"\n"Raw Data"'
-        "\n\"  Freq (Hz)    Ampl     Bias   Time(Sec)   Z'(a)    Z''(b)    GD   Err\"",
-        "{f:.9g}, 0.1, 0, 1, {re:.9g}, {im:.9g}, 0, 0",
-    ),
-    "words.csv": ("frequency,real,imaginary", "{f:.9g},{re:.9g},{im:.9g}"),
-    "primes.csv": ("f, Z', Z''", "{f:.9g}, {re:.9g}, {im:.9g}"),
-    "count.i2b": ("Some metadata\nof several lines\n\n41", "{f:.9g} {re:.9g} {im:.9g}"),
-    "powersuite.P00": (
-        "Procedure : a\n f/Hz       \t Z'/Ohm     \t -Z''/Ohm   \t time/s    \t\n 41",
-        " {f:.9g}\t {re:.9g}\t {minus:.9g}\t 1\t ",
-    ),
-    "ecochemie.dfr": ("VERSION8.0\n 41\n 1", " {f:.9g}\n {re:.9g}\n {minus:.9g}\n 0\n 0\n 0\n 0\n 0\n 0"),
-    "ivium.idf": ("\0\0H\nstarttime=\nprimary_data    \n3         \n41        ", "{re:.9g}  {im:.9g}\t{f:.9g} "),
-    "lcr.csv": ("FREQUENCY[Hz],Rs[ohm],Xs[ohm]", "{f:.9g},{re:.9g},{im:.9g}"),
-    "lcr polar.csv": ("Freq (Hz);Z (ohm);θ (deg)", "{f:.9g};{size:.9g};{deg_point}"),
-    "radians.csv": ("f (Hz),|Z| (ohm),phase (rad)", "{f:.9g},{size:.9g},{radians:.12g}"),
-    "chi.txt": (
-        "A.C. Impedance\nInit E (V) = 0\n\nFreq/Hz, Z'/ohm, Z\"/ohm, Z/ohm, Phase/deg\n",
-        "{f:.9g}, {re:.9g}, {im:.9g}, {size:.9g}, {deg_point}",
-    ),
-}
-
-
-def write(path: Path, header: str | None, row: str, z: np.ndarray, tail: str = "") -> Path:
-    lines = [header] if header is not None else []
-    for n, (f, value) in enumerate(zip(FREQUENCY, z, strict=True)):
-        degrees = math.degrees(np.angle(value))
-        comma = {"kf": f / 1e3, "kz": abs(value) / 1e3, "deg": degrees}
-        lines.append(
-            row.format(
-                n=n, f=f, re=value.real, im=value.imag, minus=-value.imag, size=abs(value), deg_point=f"{degrees:.9g}",
-                radians=math.radians(degrees),
-                **{name: f"{x:.12g}".replace(".", ",") for name, x in comma.items()},
-            )
-        )  # fmt: skip
-    path.write_text("\n".join(lines) + "\n" + tail, encoding="latin-1" if path.suffix == ".DTA" else "utf-8")
-    return path
-
-
-def write_layouts(folder: Path) -> list[Path]:
-    """Write a spectrum in every layout."""
-    z = impedance(FREQUENCY, **TRUTH)
-    return [write(folder / name, *layout, z) for name, layout in FILES.items()]
-
-
-@pytest.mark.parametrize("name", list(FILES))
-def test_files_of_analysers(tmp_path: Path, name: str):
-    z = impedance(FREQUENCY, **TRUTH)
-    tail = "</Segment1>\n<Segment2>\n" if name.endswith(".par") else ""
-    path = write(tmp_path / name, *FILES[name], z, tail)
-    assert is_spectrum(path)
-    read = fitact.read_spectrum(path)
-    np.testing.assert_allclose(read.frequency, FREQUENCY, rtol=1e-8)
-    np.testing.assert_allclose(read.values, z, rtol=1e-7)
+from tests.layouts.layout import REAL
+from tests.layouts.spectra import FILES, FREQUENCY, GAINS, SHUNT, TRUTH, Z, impedance, write, write_gain
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("mohm", 1e-3), ("kOHM", 1e3), ("MΩ", 1e6), ("GOhm", 1e9)])
@@ -118,16 +24,16 @@ def test_a_table_beyond_long_headers_and_others(tmp_path: Path):
     """Impedances below the long record of an open circuit, where Gamry's program writes them."""
     before = "\n".join(["EXPLAIN", "OCVCURVE\tTABLE", "\tPt\tT\tVf", *(f"\t{n}\t{n}\t-0.1" for n in range(3000))])
     header, row = FILES["gamry.DTA"]
-    path = write(tmp_path / "late.DTA", header.replace("EXPLAIN", before), row, impedance(FREQUENCY, **TRUTH))
+    path = write(tmp_path / "late.DTA", header.replace("EXPLAIN", before), row, Z)
     assert path.stat().st_size > 30_000
     assert is_spectrum(path)
     assert len(fitact.read_spectrum(path)) == FREQUENCY.size
 
 
 def test_sweeps_of_one_file_are_told_apart(tmp_path: Path):
-    path = write(tmp_path / "z.csv", *FILES["plain.csv"], impedance(FREQUENCY, **TRUTH))
+    path = write(tmp_path / "z.csv", *FILES["plain.csv"], Z)
     rows = path.read_text().splitlines()[1:]
-    other = write(path, *FILES["plain.csv"], impedance(FREQUENCY, **TRUTH) / 2.0).read_text().splitlines()[1:]
+    other = write(path, *FILES["plain.csv"], Z / 2.0).read_text().splitlines()[1:]
     path.write_text("\n".join([NAMES, *rows[::-1], *other[::-1], "0,0,0"]))
     found = fitact.read_spectra(path)
     assert [len(each) for each in found] == [41, 41]
@@ -142,61 +48,16 @@ def test_sweeps_of_one_file_are_told_apart(tmp_path: Path):
         app(["fit", str(path), "--spectrum", "x"])
 
 
-def load(frequency: np.ndarray) -> np.ndarray:
-    """Return the impedance of 30 ohm in series with 1 uF."""
-    return 30.0 + 1.0 / (2j * np.pi * frequency * 1e-6)
-
-
-DIGILENT = "Frequency (Hz),Channel 1 Magnitude (dB),Channel 2 Magnitude (dB)"
-
-
-@pytest.mark.parametrize(
-    ("header", "row", "scale"),
-    [
-        (f"{DIGILENT},Channel 2 Phase (deg)", "{f},{one},{two},{deg}", 1.0),
-        (
-            "% Frequency Response Analyzer\n% Frequency (Hz), Channel A Magnitude (dBm), Channel A Phase (deg),"
-            " Channel B Magnitude (dBm), Channel B Phase (deg), Math (Ka B / Ka A) Magnitude (dBm)",
-            "{f}, {one}, 10, {two}, {later}, 0",
-            1.0,
-        ),
-        ("in Sa,Frequency in Hz,Gain in dB,Phase in °,Amplitude in Vpp", "1,{f},{gain},{deg},1", 1.0),
-        ("f (kHz);Gain (V/V);Phase (rad)", "{f};{ratio};{rad}", 1e3),
-        ("#,Frequency (Hz),Amplitude (Vpp),Gain (dB),Phase (°)", "1,{f},1,{gain},{deg}", 1.0),
-        ("Frequency(Hz),Amplitude(dB),Phase(deg)", "{f},{gain},{deg}", 1.0),
-        ("Frequency Log(Hz), Gain (dB), Phase (deg)", "{log}, {gain}, {deg}", 1.0),
-        (f"{DIGILENT},Channel 1 Phase (deg)", "{f},{two},{one},{deg}", 1.0),
-    ],
-    ids=["Digilent", "Moku", "R&S", "ratio", "Keysight", "Siglent", "PicoScope", "swapped"],
-)  # fmt: skip
-def test_frequency_responses(tmp_path: Path, header: str, row: str, scale: float):
-    frequency = np.geomspace(10.0, 1e5, 30)
-    gain_over_shunt = 50.0 / (50.0 + load(frequency))
-    lines = [header]
-    for f, h in zip(frequency, gain_over_shunt, strict=True):
-        gain, degrees = 20.0 * math.log10(abs(h)), math.degrees(np.angle(h))
-        cells = {
-            "one": -3.0,
-            "two": gain - 3.0,
-            "gain": gain,
-            "deg": degrees,
-            "later": degrees + 10.0,
-            "log": math.log10(f),
-        }
-        lines.append(row.format(f=f / scale, ratio=abs(h), rad=math.radians(degrees), **cells))
-    path = tmp_path / "bode.csv"
-    path.write_text("\n".join(lines), encoding="latin-1")
-    read = fitact.read_spectrum(path)
-    assert read.channel == "Vsc"
-    np.testing.assert_allclose(read.frequency, frequency, rtol=1e-12)
-    np.testing.assert_allclose(read.values, gain_over_shunt, rtol=1e-9)
-    assert bool(read.warnings) == ("Channel 1 Phase" in header)
-    over_shunt = fitact.read_spectrum(path, shunt=50.0)
-    np.testing.assert_allclose(over_shunt.values, load(frequency), rtol=1e-8)
+@pytest.mark.parametrize("name", GAINS)
+def test_gains_over_a_shunt_are_impedances(tmp_path: Path, name: str):
+    path = write_gain(name, tmp_path)
+    assert bool(fitact.read_spectrum(path).warnings) == (name == "swapped.csv")
+    over_shunt = fitact.read_spectrum(path, shunt=SHUNT)
+    np.testing.assert_allclose(over_shunt.values, Z, rtol=1e-8)
 
 
 def test_a_band(tmp_path: Path):
-    path = write(tmp_path / "z.csv", *FILES["plain.csv"], impedance(FREQUENCY, **TRUTH))
+    path = write(tmp_path / "z.csv", *FILES["plain.csv"], Z)
     part = fitact.read_spectrum(path).select_band(10.0, 1e4)
     assert part.frequency[[0, -1]] == pytest.approx([10.0, 1e4])
     assert "10 Hz to 10 kHz" in part.notes[-1]
@@ -204,7 +65,6 @@ def test_a_band(tmp_path: Path):
         fitact.read_spectrum(path).select_band(10.0, 15.0)
 
 
-REAL = Path(__file__).parents[3] / "shared" / "real"
 COUNTS = {
     "impedance_py": {"exampleDataGamry.DTA": 72, "exampleDataAutolab.txt": 41, "exampleDataParstat.txt": 31},
     "bode": {"R10k_0.csv": 1001, "MokuGo_47R_100R_shunt.csv": 512},
@@ -267,7 +127,7 @@ def test_kramers_kronig_passes_what_a_circuit_gives(noise: float):
 
 
 def test_kramers_kronig_names_a_bad_point_and_the_band_without_it():
-    z = impedance(FREQUENCY, **TRUTH) * (1.0 + 1e-3 * np.random.default_rng(1).standard_normal(FREQUENCY.size))
+    z = Z * (1.0 + 1e-3 * np.random.default_rng(1).standard_normal(FREQUENCY.size))
     z[10] *= 1.1
     found = check_kramers_kronig(fitact.Spectrum.from_arrays(FREQUENCY, z))
     assert not found.passed
@@ -278,7 +138,7 @@ def test_kramers_kronig_names_a_bad_point_and_the_band_without_it():
 
 
 def test_inspect(tmp_path: Path, capfd):
-    path = write(tmp_path / "z.csv", *FILES["plain.csv"], impedance(FREQUENCY, **TRUTH))
+    path = write(tmp_path / "z.csv", *FILES["plain.csv"], Z)
     with pytest.raises(SystemExit):
         app(["inspect", str(path), "--band", "10Hz..10kHz"])
     printed = capfd.readouterr().out
