@@ -14,7 +14,7 @@ from fitact.data.readers.capture import FULL_SCALE, Capture, FileChannel
 from fitact.data.readers.read import read_capture
 from fitact.data.readers.spectrum import is_swept
 from fitact.data.readers.text import is_binary
-from fitact.data.record import CHANNEL_UNITS, OVERFLOW
+from fitact.data.record import CHANNEL_UNITS, MINIMUM_SAMPLES, OVERFLOW
 from fitact.errors import InputError
 from fitact.files import read_head
 from fitact.tables import align_table
@@ -23,13 +23,18 @@ from fitact.tables import align_table
 def preview(path: str | os.PathLike[str], rate: float | None = None) -> str:
     """Return columns, first rows and a guess for a file that is refused; `rate` (Hz) was stated by the user.
 
-    A text without rows of numbers is shown as it is. Of other files that cannot be read nothing is shown.
+    A text without enough rows of numbers is shown as it is. Of other files that cannot be read nothing is shown.
     """
     for given in (None, rate or 1.0):  # any rate shows the columns of a file without times
         with contextlib.suppress(InputError):
             capture = read_capture(path, rate=given)
+            if capture.time.size < MINIMUM_SAMPLES:
+                break
             is_timed = given is None
-            title = f"{capture.source} ({capture.format}) holds {capture.time.size:,} rows:"
+            count = len(capture.channels)
+            title = (
+                f"{capture.source} ({capture.format}) holds {capture.time.size:,} rows in {count} columns of values:"
+            )
             table = describe_rows(capture.channels, capture.time if is_timed else None)
             reason, command = guess_command(capture, None if is_timed else rate, is_timed)
             return "\n".join([title, *table, f"guess {reason}" + f":\n  {command}" * bool(command)])
@@ -42,11 +47,16 @@ def preview(path: str | os.PathLike[str], rate: float | None = None) -> str:
 
 
 def describe_rows(
-    columns: Sequence[FileChannel], time: Float[np.ndarray, " samples"] | None = None, max_rows: int = 5
+    columns: Sequence[FileChannel],
+    time: Float[np.ndarray, " samples"] | None = None,
+    max_rows: int = 5,
+    max_columns: int = 10,
 ) -> list[str]:
-    """Return a table of the first rows of the columns, in SI units, beside their times or numbers."""
+    """Return a table of the first rows and columns, in SI units, beside their times or numbers."""
     shown = [("row", 1 + np.arange(columns[0].values.size))] if time is None else [("time (s)", time)]
-    shown += [(column.name + f" ({column.unit})" * bool(column.unit), column.values) for column in columns]
+    shown += [
+        (column.name + f" ({column.unit})" * bool(column.unit), column.values) for column in columns[:max_columns]
+    ]
     rows = [[f"{values[i]:.6g}" for _, values in shown] for i in range(min(max_rows, shown[0][1].size))]
     return [f"  {line}" for line in align_table([[name for name, _ in shown], *rows])]
 
@@ -57,11 +67,21 @@ def guess_command(capture: Capture, rate: float | None = None, is_timed: bool = 
     `rate` (Hz) is what the user stated. A file that is not timed needs a rate.
     """
     columns = capture.channels
+    if capture.time.size < MINIMUM_SAMPLES:
+        return f"none: {capture.time.size} samples are too few to fit", ""
     if not is_timed and _is_frequency(columns[0]):
         return f"by '{columns[0].name}': a spectrum; name its columns as in frequency_Hz,Z_real_ohm,Z_imag_ohm", ""
-    known = {channel for channel in CHANNEL_UNITS for column in columns if column.name.lower() == channel.lower()}
+    known = {
+        channel: column for channel in CHANNEL_UNITS for column in columns if column.name.lower() == channel.lower()
+    }
     assigned, remarks, options = _guess_channels(columns, known), list[str](), list[str]()
-    if not assigned:
+    channels = known | assigned
+    scaled = {
+        channel: column.unit_text == FULL_SCALE
+        for channel, column in channels.items()
+        if column.unit_text and column.unit != CHANNEL_UNITS[channel]
+    }
+    if not assigned and not scaled:
         return "by units and sizes: no other column is a voltage or a current that varies; export Vsc or I", ""
     if rate is not None:
         options += ["--rate", f"{rate:.9g}Hz"]
@@ -71,16 +91,16 @@ def guess_command(capture: Capture, rate: float | None = None, is_timed: bool = 
         options += ["--rate", guessed]
     for channel, column in assigned.items():
         options += ["--channel", f"{channel}={column.name}"]
-        options += ["--scale", f"{channel}=10"] if column.unit_text == FULL_SCALE else []
-    if "--scale" in options:
-        remarks.append("with your full scales in place of 10")
-    channels = known | set(assigned)
+    for channel, is_full_scale in scaled.items():
+        options += ["--scale", f"{channel}={'10' if is_full_scale else '0.001'}"]
+    if scaled:
+        remarks.append("with your factors or full scales in place of these")
     if "V" not in channels:
         remarks.append("a fit needs a scene that states the drive")
     elif "Vsc" not in channels:
         remarks.append("a fit needs a scene with [measurement] channels = ['I']")
     reason = "by units and sizes, which may mislead" + f" ({'; '.join(remarks)})" * bool(remarks)
-    command = "fit" if {"V", "Vsc"} <= channels else "inspect"
+    command = "fit" if {"V", "Vsc"} <= channels.keys() else "inspect"
     return reason, shlex.join(["fitact", command, capture.source, *options])
 
 

@@ -109,6 +109,8 @@ UNASSIGNED = {
     "a current": (table("time_s,U (V),shunt (uA)", TIME, V, 1e6 * CURRENT), 0, {"V": V, "I": CURRENT}),
     "one voltage": (table("time_s,CH1", TIME, VSC), 0, {"Vsc": VSC}),
     "V alone is named": (table("time_s,V_V,skin", TIME, V, VSC), 0, BOTH),
+    "a shunt's voltage": (table("time_s,I_V,V_V", TIME, 1e3 * CURRENT, V), 2, {"V": V, "I": CURRENT}),
+    "an unknown unit": (table("time_s,V_V,Vsc_div", TIME, V, 1e3 * VSC), 2, BOTH),
     "sound": (write_sound, 0, {"V": V / 20.0, "Vsc": VSC / 2.0}),
     "no time": (table("skin;drive", VSC, V, delimiter=";"), 2, BOTH),
     "no names": (table("", V, VSC), 2, BOTH),
