@@ -14,6 +14,7 @@ import signal
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -25,8 +26,8 @@ from fitact.data.readers.capture import resolve_channels
 from fitact.data.readers.read import read_capture
 from fitact.data.readers.spectrum import is_spectrum
 from tests.layouts.layout import REAL, SCOPE
-from tests.layouts.records import ARRAY_WRITERS
-from tests.layouts.spectra import write_layouts
+from tests.layouts.records import RECORDS
+from tests.layouts.spectra import SPECTRA
 
 SECONDS = 10.0  # time limit for one file, s
 MEGABYTES = 1000.0  # limit on the rise of peak memory by one file, MB; a string of damaged length in HDF5 takes 800
@@ -38,14 +39,15 @@ TOKENS = (
 
 
 def samples() -> dict[str, bytes]:
-    """Return the files to damage: the shipped ones, and one of each kind with named arrays."""
-    found = {path.name: path.read_bytes() for path in sorted(SCOPE.iterdir()) if path.suffix != ".md"}
-    with tempfile.TemporaryDirectory() as folder:
-        arrays = [write(Path(folder)) for write in ARRAY_WRITERS]
-        found |= {path.name: path.read_bytes() for path in arrays}
-        spectra = write_layouts(Path(folder))
-        spectra += [path for kind in ("bode", "impedance_py", "pyimpspec") for path in sorted((REAL / kind).glob("*"))]
-        found |= {f"spectrum {path.name}": path.read_bytes() for path in spectra}
+    """Return the files to damage: the shipped ones, one in each layout, and others' spectra where they are at hand."""
+    paths = [path for path in sorted(SCOPE.iterdir()) if path.suffix != ".md"]
+    paths += [path for kind in ("bode", "impedance_py", "pyimpspec") for path in sorted((REAL / kind).glob("*"))]
+    found = {path.name: path.read_bytes() for path in paths}
+    for number, layout in enumerate((*RECORDS, *SPECTRA)):
+        if layout.write is not None:
+            with tempfile.TemporaryDirectory() as folder:
+                path = layout.write(Path(folder))
+                found[f"{number} {path.name}"] = path.read_bytes()
     return found
 
 
@@ -157,7 +159,8 @@ def findings(count: int, seed: int, first: int = 0, keep: Path | None = None) ->
     files = samples()
     before = signal.signal(signal.SIGALRM, late)
     try:
-        with tempfile.TemporaryDirectory() as folder:
+        with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)  # which a user would see above the sentence
             for number in range(first, first + count):
                 name, content = broken(files, seed, number)
                 path = keep or Path(folder) / name

@@ -101,6 +101,13 @@ def test_what_was_left_out_is_noted(tmp_path: Path):
     assert any("source of 1 V" in note for note in spectrum.notes)
 
 
+def test_a_damaged_number_of_an_AC_analysis_is_refused(tmp_path: Path):
+    path = write_gain("ltspice.txt", tmp_path)
+    path.write_text(path.read_text().replace("0.", "0.1.", 1))
+    with pytest.raises(fitact.InputError, match="no line names a frequency"):
+        fitact.read_spectrum(path)
+
+
 def insert(line: str) -> Callable[[list[str]], list[str]]:
     return lambda lines: [*lines[:100], line, *lines[100:]]
 

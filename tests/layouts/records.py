@@ -208,7 +208,6 @@ def write_wav(folder: Path) -> Path:
     return folder / "card.wav"
 
 
-ARRAY_WRITERS = (write_mat, write_mat_73, write_hdf5, write_netcdf, write_netcdf3, write_npz, write_tdms)
 UNITS, TIMES, GRID, CLOCK = "time, units", "time", "time step, units", "time of day"
 ATTENUATION, VARIANT = "time, units, attenuation", "as without"
 SCOPE_FILES = {"kind": "binary", "extra": "scope"}

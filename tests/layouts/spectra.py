@@ -170,11 +170,6 @@ def write_pair(first: str, second: str, folder: Path) -> Path:
     return path
 
 
-def write_layouts(folder: Path) -> list[Path]:
-    """Write a spectrum in every layout, as `fuzz` damages them."""
-    return [write_impedance(name, folder) for name in FILES]
-
-
 def _ending(name: str) -> str:
     return ".idf, .ids" if name.endswith(".idf") else Path(name).suffix
 

@@ -165,7 +165,7 @@ def _find_ac_analyses(lines: Sequence[str]) -> Iterator[Rows]:
     """Yield frequency, real and imaginary part of a voltage in an AC analysis that LTspice exports."""
     if not lines or not re.match(r"Freq\.\t[^\t]+$", lines[0]):  # one voltage
         return
-    number = r"([-+]?[\d.]+(?:[eE][-+]?\d+)?)"
+    number = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
     polar, parts = (re.compile(rf"{number}\t{rest}") for rest in (rf"\({number}dB,{number}\S*\)", f"{number},{number}"))
     rows = []
     for line in filter(str.strip, lines[1:]):
