@@ -18,7 +18,7 @@ from fitact.blas import limit_to_one_thread
 from fitact.compiled import double_precision
 from fitact.data.readers.spectrum import is_spectrum, read_spectrum
 from fitact.data.readers.stream import Block, stream_record
-from fitact.data.record import Record, fundamental_frequency
+from fitact.data.record import STATE_RATE, Record, fundamental_frequency
 from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
 from fitact.files import atomic_write, require_folder
@@ -225,7 +225,7 @@ def _describe_head(first: list[Block], frequency: float | None, window: float | 
     steps = np.diff(times)
     usual = float(np.median(steps))
     if not usual > 0.0:
-        raise InputError(f"{source}: the time does not increase; state the sampling rate (--rate) if it was rounded")
+        raise InputError(f"{source}: the time does not increase; if it was rounded when written, {STATE_RATE}")
     whole = steps[(steps > 0.5 * usual) & (steps < 1.5 * usual)]
     step = float(np.mean(whole))
     notes = tuple(dict.fromkeys(note for block in first for note in block.notes))
