@@ -57,6 +57,12 @@ FILES = {
         "{f:.9g}, 0.1, 0, 1, {re:.9g}, {im:.9g}, 0, 0",
     ),
     "words.csv": ("frequency,real,imaginary", "{f:.9g},{re:.9g},{im:.9g}"),
+    "chip.csv": (",Frequency,Impedance,Phase", "{n},{f:.9g},{size:.9g},{deg_point}"),
+    "registers.csv": (
+        "Frequency,Impedance,Phase,Real,Imaginary,Magnitude",
+        "{f:.9g},{size:.9g},{deg_point},-16103,-1843,16208.12",
+    ),
+    "powersuite.txt": ("Frequency\t Zre\t Zimg", "{f:.9g}\t {re:.9g}\t {im:.9g}"),
     "primes.csv": ("f, Z', Z''", "{f:.9g}, {re:.9g}, {im:.9g}"),
     "count.i2b": ("Some metadata\nof several lines\n\n41", "{f:.9g} {re:.9g} {im:.9g}"),
     "powersuite.P00": (

@@ -255,8 +255,8 @@ def _find_blocks(lines: Sequence[str]) -> Iterator[Rows]:
         above = 0  # cells of the line above the block
         for line in (*lines, ""):
             cells = split_cells(line, delimiter)
-            numbers = [parse_number(cell, delimiter != ",") for cell in cells]
-            if len(cells) == 3 and None not in numbers:
+            numbers = [parse_number(cell, delimiter != ",") for cell in cells] if len(cells) == 3 else [None]
+            if None not in numbers:
                 block.append([number for number in numbers if number is not None])
                 continue
             if len(block) >= MINIMUM_POINTS and above != 3 and _is_swept(np.array(block)[:, 0]):
@@ -272,19 +272,22 @@ def _is_swept(frequency: np.ndarray, min_ratio: float = 3.0) -> bool:
 
 def _find_layout(names: list[str]) -> _Layout | None:
     """Return the meaning of the columns with these names, or None if they are no spectrum."""
-    frequency = _find_name(_FREQUENCY, names)
+    frequency, size = _find_name(_FREQUENCY, names), _find_name(_MAGNITUDE, names)
+    phases = [i for i, name in enumerate(names) if _PHASE.search(name)]
     if frequency is None:
         return None
+    # where a chip (AD5933) writes its registers beside them, real and imaginary part are counts of a converter
+    is_polar = size is not None and bool(phases) and re.search(r"z|impedance", names[size], re.IGNORECASE)
     for patterns in ((_REAL, _IMAGINARY), (_RESISTANCE, _REACTANCE)):
         real, imaginary = (_find_name(pattern, names) for pattern in patterns)
-        if real is not None and imaginary is not None:
+        bare = real is not None and names[real].lower() in ("real", "re")
+        if real is not None and imaginary is not None and not (bare and is_polar):
             return _parts_layout((frequency, real, imaginary), [names[i] for i in (frequency, real, imaginary)])
     if (pair := _pair_layout(names, frequency)) is not None:
         return pair
-    size, phases = _find_name(_MAGNITUDE, names), [i for i, name in enumerate(names) if _PHASE.search(name)]
     if not phases:
         return None
-    if size is not None and (_OHM.search(names[size]) or "z" in names[size].lower()):
+    if size is not None and (is_polar or _OHM.search(names[size])):
         factor, turn, hertz = _find_factor(_OHM, names[size]), _find_turn(names[phases[0]]), _to_hertz(names[frequency])
         places = frequency, size, phases[0]
         return _Layout("impedance", places, lambda x: (hertz(x[:, 0]), factor * x[:, 1] * np.exp(turn * x[:, 2])))

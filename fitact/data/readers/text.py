@@ -2,15 +2,17 @@
 
 import bisect
 import contextlib
+import csv
 import dataclasses
 import gzip
 import io
 import math
+import os
 import re
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import IO, NoReturn, cast
+from typing import IO, Any, NoReturn, cast
 
 import numpy as np
 from jaxtyping import Float
@@ -49,9 +51,10 @@ def read_text(
             head = stream.read(_HEAD_BYTES)
             stream.seek(0)
             table = _TableParser.from_head(head.rstrip(PADDING), source, pick, read_sidecar(path), rate)
-            blocks = _blocks(iter(lambda: stream.read(BLOCK_BYTES), b""), source, max_bytes)
-            for block in track_progress(blocks, f"reading {source}", path.stat().st_size, file.tell):
-                table.add(block)
+            if stream is not file or not table.add_file(path):
+                blocks = _blocks(iter(lambda: stream.read(BLOCK_BYTES), b""), source, max_bytes)
+                for block in track_progress(blocks, f"reading {source}", path.stat().st_size, file.tell):
+                    table.add(block)
     except (OSError, EOFError, zlib.error) as error:
         raise read_error(source, error) from error
     return table.to_capture()
@@ -199,7 +202,8 @@ class _TableParser:
                 return
             first, block = first + skipped, parts[skipped]
         block = _join_thousands(block) if self._has_thousands else block
-        block = block.replace(b"\r", b"").replace(b'"', b"").rstrip(PADDING).replace(MINUS.encode(), b"-")
+        block = block.replace(b"\r", b"").replace(b'"', b"").rstrip(PADDING)
+        block = block if block.isascii() else block.replace(MINUS.encode(), b"-")
         block = _CLOCK.sub(_write_seconds, block) if self._header.is_clock else block
         if self._header.delimiter == " ":
             block = re.sub(rb"(?m)^ +| +$", b"", re.sub(rb"[ \t]+", b" ", block))
@@ -207,9 +211,32 @@ class _TableParser:
         if numbers is None:
             numbers, lines = self._parse_line_by_line(block, first)
         if len(numbers):
-            self._parts.append(numbers)
-            self._lines.append(lines or range(first, first + len(numbers)))
-            self._starts.append(self._starts[-1] + len(numbers))
+            self._add_rows(numbers, lines or range(first, first + len(numbers)))
+
+    def _add_rows(self, numbers: np.ndarray, lines: Sequence[int]) -> None:
+        self._parts.append(numbers)
+        self._lines.append(lines)
+        self._starts.append(self._starts[-1] + len(numbers))
+
+    def add_file(self, path: Path, large: int = 1_048_576) -> bool:
+        """Add all rows of a plain file above `large` bytes at once; return whether each has a number in every cell.
+
+        Nothing else is done to the text, which costs as much as to parse it. A last column may be empty, as behind a
+        delimiter at the end of each line.
+        """
+        header = self._header
+        words, last = set(range(header.width)) - header.numeric, header.width - 1
+        is_empty = words <= {last} and not any("".join(row.cells[last:]) for row in header.data_rows if words)
+        if path.stat().st_size <= large or header.delimiter == " " or header.is_clock or not is_empty:
+            return False
+        skipped = header.data_rows[0].number - 1
+        numbers = self._parse_large(
+            os.fspath(path), skiprows=skipped, decimal="," if header.decimal_comma else ".", quoting=csv.QUOTE_NONE,
+            dtype={i: "category" if i in words else float for i in range(header.width)},
+        )  # fmt: skip
+        if numbers is not None:
+            self._add_rows(numbers, range(skipped + 1, skipped + 1 + len(numbers)))
+        return numbers is not None
 
     def _parse_fast(self, block: bytes, large: int = 1_048_576) -> np.ndarray | None:
         """Return the rows, parsed by NumPy or above `large` bytes by pandas, or None if a line has another form."""
@@ -226,7 +253,7 @@ class _TableParser:
         if self._header.decimal_comma:
             block = block.replace(b",", b".")
         if len(block) > large:
-            return self._parse_large(block)
+            return self._parse_large(io.BytesIO(block), usecols=sorted(set(self._column_indices)), dtype=float)
         try:
             return np.loadtxt(
                 io.BytesIO(block), delimiter=delimiter, ndmin=2, comments=None, usecols=self._column_indices,
@@ -235,19 +262,17 @@ class _TableParser:
         except ValueError:
             return None
 
-    def _parse_large(self, block: bytes) -> np.ndarray | None:
+    def _parse_large(self, text: str | io.BytesIO, **options: Any) -> np.ndarray | None:
         """Return the rows, parsed by pandas, which takes half a second to import and a fifth of NumPy's time to run."""
         import pandas
 
-        places = sorted(set(self._column_indices))
         try:
             frame = pandas.read_csv(
-                io.BytesIO(block), sep=self._header.delimiter, header=None, usecols=places, dtype=float,
-                na_filter=False, encoding="latin-1",
-            )  # fmt: skip
-        except ValueError:
+                text, sep=self._header.delimiter, header=None, na_filter=False, skip_blank_lines=False, **options
+            )
+            return frame[self._column_indices].to_numpy(dtype=float)
+        except (ValueError, KeyError):
             return None
-        return frame.to_numpy()[:, [places.index(place) for place in self._column_indices]]
 
     def _parse_line_by_line(self, block: bytes, first: int) -> tuple[np.ndarray, list[int]]:
         """Return the rows, parsed line by line to locate an invalid cell or to skip empty lines."""
@@ -334,7 +359,8 @@ class _TableParser:
         return capture
 
     def _take_columns(self) -> list[np.ndarray]:
-        columns = [np.concatenate([part[:, i] for part in self._parts]) for i in range(len(self._column_indices))]
+        whole = self._parts[0] if len(self._parts) == 1 else np.concatenate(self._parts or [np.empty((0, 1))])
+        columns = list(np.ascontiguousarray(whole.T))
         self._parts.clear()
         return columns
 
