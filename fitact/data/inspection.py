@@ -110,15 +110,17 @@ def inspect(
     channels: Mapping[str, str] | None = None,
     scale: Mapping[str, float] | None = None,
     rate: float | None = None,
+    segment: int | None = None,
 ) -> Inspection:
     """Inspect a file without fitting it; channels are V, Vsc and I if known or named, otherwise those of the file.
 
-    `channels`, `scale` and `rate` as in `fitact.read`.
+    `channels`, `scale`, `rate` and `segment` as in `fitact.read`.
 
     Raises:
         InputError: the file cannot be read, or its V, Vsc or I could not be fitted.
     """
-    capture = replace_rounded_times(merge_other_files(read_capture(path, rate=rate), path, channels or {}, rate), rate)
+    capture = read_capture(path, rate=rate, segment=segment)
+    capture = replace_rounded_times(merge_other_files(capture, path, channels or {}, rate, segment), rate)
     if channels or scale or has_standard_names(capture):
         record = to_record(capture, channels or {}, scale or {})
         arrays = {name: (record[name], CHANNEL_UNITS[name]) for name in record.channels}

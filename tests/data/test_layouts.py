@@ -1,5 +1,6 @@
 """Files as other people's programs write them: each is read with the written values, or refused for its kind."""
 
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -9,7 +10,9 @@ import pytest
 import scipy.io
 
 import fitact
+from fitact.cli import app
 from fitact.data.clipping import clipping_mask
+from fitact.data.readers.stream import stream_record
 
 STEP, COUNT = 20e-6, 300
 TIME = STEP * np.arange(COUNT)
@@ -146,17 +149,6 @@ REFUSED = {
     "a coarse clock": (
         with_clock("Time,V_V,Vsc_V", [c[:11] for c in clocks()]).splitlines(), r"resolution of 10 ms.*--rate 100kHz",
     ),
-    "steps of a simulation": (
-        insert("Step Information: Rsc=160K  (Run: 2/2)")(["time\tV_V\tVsc_V", *rows(TIME, V, VSC, delimiter="\t")]),
-        r"line 101: holds several runs.*Rsc=160K.*export one",
-    ),
-    "segments of LabVIEW": (
-        [
-            *LVM.splitlines(), *rows(TIME, V, VSC, delimiter="\t"), "",
-            *LVM.splitlines()[2:], *rows(TIME, V, VSC, delimiter="\t"),
-        ],
-        r"several runs or segments, the next from 'Channels' on; keep one",
-    ),
     "words among rows": (
         insert("pause,,")(["time_s,V_V,Vsc_V", *rows(TIME, V, VSC)]), r"line 101, column 1: 'pause' is not a number",
     ),
@@ -178,6 +170,103 @@ def test_refusals_say_what_was_found_and_what_helps(kind: str, tmp_path: Path):
     assert re.search(words, message), message
     assert "Rohde" not in message
     assert "NAME.csv" not in message
+
+
+def noisy(number: int) -> np.ndarray:
+    """Return V and Vsc of a segment, other in each, with noise and as an 8-bit converter rounds them."""
+    rng = np.random.default_rng(number)
+    waves = np.stack([V, VSC]) * (1.0 + 0.1 * number) + rng.normal(scale=0.1, size=(2, COUNT))
+    return np.round(waves / 0.05) * 0.05
+
+
+def tabbed(number: int, time: np.ndarray = TIME, **how: str) -> str:
+    return "\n".join(rows(time, *noisy(number), delimiter="\t", **how))
+
+
+LVM_HEAD, LVM_SEGMENT = "LabVIEW Measurement\nX_Columns\tOne\n***End_of_Header***\n\n", LVM.split("\n", 2)[2]
+NUMBERS = (1, 2, 3)
+SEGMENTED: dict[str, tuple[str, dict[str, object]]] = {
+    "steps of LTspice": (
+        "time\tV(drive)\tV(skin)\n"
+        + "\n".join(f"Step Information: R={n}K  (Run: {n}/3)\n{tabbed(n, form='%.9e')}" for n in NUMBERS),
+        {"channels": {"V": "V(drive)", "Vsc": "V(skin)"}},
+    ),
+    "LabVIEW": (LVM_HEAD + "\n\n".join(LVM_SEGMENT + tabbed(n) for n in NUMBERS), {}),
+    "LabVIEW, whose time goes on": (
+        LVM_HEAD + "\n\n".join(LVM_SEGMENT + tabbed(n, TIME + (n - 1) * COUNT * STEP) for n in NUMBERS), {},
+    ),
+    "LabVIEW without times": (
+        LVM_HEAD + "\n\n".join(
+            LVM_SEGMENT + "\n".join("\t" + row for row in rows(*noisy(n), delimiter="\t")) for n in NUMBERS
+        ),
+        {},
+    ),
+    "sequence of LeCroy": (
+        f"LECROYWS3024,42561,Waveform\nSegments,3,SegmentSize,{COUNT}\nSegment,TrigTime,TimeSinceSegment1\n"
+        + "".join(f"#{n},25-Nov-2026 10:14:15,{n}\n" for n in NUMBERS) + "Time,V,Vsc\n"
+        + "\n".join(line for n in NUMBERS for line in rows(TIME, *noisy(n))),
+        {},
+    ),
+    "files after one another": (
+        "\n".join(line for n in NUMBERS for line in ["time_s,V_V,Vsc_V", *rows(TIME, *noisy(n)), ""]), {},
+    ),
+    "time that starts anew": (
+        "\n".join(["time_s,V_V,Vsc_V", *(line for n in NUMBERS for line in rows(TIME, *noisy(n)))]), {},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("layout", SEGMENTED)
+def test_one_of_several_segments_is_chosen(layout: str, tmp_path: Path):
+    text, how = SEGMENTED[layout]
+    path = tmp_path / "record.csv"
+    path.write_text(text, encoding="utf-8", newline="\n")
+    for read in (fitact.read, fitact.inspect):
+        with pytest.raises(fitact.InputError, match=r"holds 3 segments .* choose one, as --segment 1"):
+            read(path, **how)
+        with pytest.raises(fitact.InputError, match=r"holds 3 segments .* there is no number 4"):
+            read(path, segment=4, **how)
+    for number in NUMBERS:
+        record = fitact.read(path, segment=number, **how)
+        np.testing.assert_allclose(record.time - record.time[0], TIME, atol=1e-9)
+        for name, truth in zip(("V", "Vsc"), noisy(number), strict=True):
+            np.testing.assert_allclose(record[name], truth, atol=6e-6)
+        assert fitact.inspect(path, segment=number, **how).time.size == COUNT
+
+
+def test_the_command_line_and_streams_choose_a_segment(tmp_path: Path, capsys):
+    path, truth = tmp_path / "record.csv", noisy(2)
+    path.write_text(SEGMENTED["LabVIEW"][0])
+    with pytest.raises(SystemExit):
+        app(["inspect", str(path), "--segment", "2", "--json"])
+    shown = json.loads(capsys.readouterr().out)
+    assert [channel["max"] for channel in shown["channels"]] == pytest.approx(truth.max(axis=1).tolist())
+    blocks = list(stream_record(path, segment=2))
+    np.testing.assert_allclose(np.concatenate([block.channels["Vsc"] for block in blocks]), truth[1], atol=6e-6)
+    for asked, words in (("0", "write a number from 1"), ("x", "write a number from 1"), ("4", "no number 4")):
+        with pytest.raises(fitact.InputError, match=words):
+            app(["inspect", str(path), "--segment", asked])
+    with pytest.raises(fitact.InputError, match=r"line 314: another segment begins .* choose one, as --segment 1"):
+        list(stream_record(path))
+
+
+def test_a_file_with_one_segment_has_no_second(tmp_path: Path):
+    path = tmp_path / "record.csv"
+    path.write_text(LAYOUTS["LabVIEW with times"][0])
+    assert len(fitact.read(path, segment=1)) == COUNT
+    with pytest.raises(fitact.InputError, match="holds one segment, so there is no number 2"):
+        fitact.read(path, segment=2)
+
+
+def test_refusals_within_a_segment_name_its_line_in_the_file(tmp_path: Path):
+    path = tmp_path / "record.csv"
+    lines = SEGMENTED["LabVIEW"][0].splitlines()
+    place = lines.index(tabbed(2).splitlines()[99])
+    lines[place] = "0.1\toops\t1"
+    path.write_text("\n".join(lines))
+    with pytest.raises(fitact.InputError, match=f"line {place + 1}, column 2: 'oops' is not a number"):
+        fitact.read(path, segment=2)
+    assert len(fitact.read(path, segment=3)) == COUNT
 
 
 def test_only_a_file_of_rohde_and_schwarz_gets_their_advice(tmp_path: Path):

@@ -13,13 +13,13 @@ import types
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import lazy_loader
 import numpy as np
 
 from fitact.data.readers import layouts
-from fitact.data.readers.capture import FULL_SCALE, Capture, FileChannel, Pick
+from fitact.data.readers.capture import FULL_SCALE, Capture, FileChannel, Pick, choose_segment, select_segment
 from fitact.data.readers.matlab import read_mat
 from fitact.errors import InputError
 
@@ -57,8 +57,8 @@ def is_known_binary(head: bytes, suffix: str) -> bool:
     return _find_reader(head, "" if suffix.lower() in (".csv", ".txt") else suffix) is not None
 
 
-def read_binary(path: Path, source: str, head: bytes, pick: Pick) -> Capture:
-    """Return the channels of a binary file that `pick` selects, in SI units."""
+def read_binary(path: Path, source: str, head: bytes, pick: Pick, segment: int | None = None) -> Capture:
+    """Return the channels of a binary file that `pick` selects, in SI units, of one `segment` (from 1) of several."""
     reader = _find_reader(head, path.suffix)
     if reader is None:
         raise InputError(f"{source}: is neither a text file nor a known binary format; export the record as CSV")
@@ -66,7 +66,9 @@ def read_binary(path: Path, source: str, head: bytes, pick: Pick) -> Capture:
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # from parsers that continue after a problem
-            return reader(path, source, pick)
+            if reader is _read_scope:
+                return _read_scope(path, source, pick, segment)
+            return choose_segment(reader(path, source, pick), segment)
     except InputError:
         raise
     except Exception as error:  # a dozen parsers with exceptions of their own
@@ -83,8 +85,12 @@ def _find_reader(head: bytes, suffix: str) -> Callable[[Path, str, Pick], Captur
     return next((reader for start, reader in readers.items() if head.startswith(start)), scope)
 
 
-def _read_scope(path: Path, source: str, pick: Pick) -> Capture:
-    wfm = _import_extra("RigolWFM.wfm", "scope", source).Wfm.from_file(str(path))
+def _read_scope(path: Path, source: str, pick: Pick, segment: int | None = None) -> Capture:
+    reader = _import_extra("RigolWFM.wfm", "scope", source).Wfm
+    wfm = reader.from_file(str(path))
+    if getattr(wfm, "frame_count", 1) > 1:  # FastFrame of Tektronix
+        wfm = reader.from_file(str(path), frame=select_segment(segment, wfm.frame_count, source))
+        segment = None
     if not wfm.channels:
         raise InputError(f"{source}: holds no analogue channel; export one")
     names = [str(channel.name) for channel in wfm.channels]
@@ -100,7 +106,17 @@ def _read_scope(path: Path, source: str, pick: Pick) -> Capture:
             times.append(np.asarray(channel.times, dtype=float))
     _check_one_grid(times, [channel.name for channel in channels], source)
     maker, unread = str(wfm.header_name) or "oscilloscope", tuple(name for name in names if name not in wanted)
-    return Capture(source, maker, times[0], tuple(channels), unread_columns=unread)
+    capture = Capture(source, maker, times[0], tuple(channels), unread_columns=unread)
+    parts = choose_segment(capture, segment, _count_sequence(path))
+    return dataclasses.replace(parts, time=times[0][: parts.time.size])  # since the trigger of the segment
+
+
+def _count_sequence(path: Path, place: int = 144) -> int:
+    """Return the number of segments in LeCroy's sequence mode, `place` bytes into its WAVEDESC, or 1."""
+    _, mark, block = path.read_bytes().partition(b"WAVEDESC")
+    start = place - len(mark)
+    order: Literal["little", "big"] = "little" if block[34 - len(mark) : 35 - len(mark)] == b"\1" else "big"
+    return int.from_bytes(block[start : start + 4], order) if mark and block[8:].startswith(b"LECROY_2") else 1
 
 
 def _read_wav(path: Path, source: str, pick: Pick) -> Capture:

@@ -53,9 +53,6 @@ def read_header(
     maker = next((maker for maker, mark in layouts.MAKERS if mark.search(head)), "text")
     numeric, is_clock = header.numeric | header.standard_columns(), is_clock and header.clock is not None
     header = dataclasses.replace(header, numeric=numeric, maker=maker, rate=rate, is_clock=is_clock)
-    segments = header.find_values(layouts.SEGMENT_KEYS)[:1]
-    if segments and (parse_number(segments[0], header.decimal_comma) or 1.0) > 1.0:
-        raise InputError(f"{source}: holds {segments[0]} segments; export one of them")
     if header.time is None and header.time_grid[1] is None:
         count = len(header.numeric)
         found = f"{count} column{'s' * (count > 1)} of numbers" + ("" if header.names else " without names")
@@ -98,6 +95,7 @@ class Header:
     data_rows: list[TextRow]
     numeric: frozenset[int]  # indices of the columns of numbers
     source: str
+    first_line: str = ""  # if it has words, of which another copy begins another segment
     maker: str = "text"
     rate: float | None = None  # stated by the user, Hz
     is_clock: bool = False  # whether the time column holds seconds since midnight
@@ -128,7 +126,9 @@ class Header:
         end = data[first].number if first < len(data) else len(lines)
         comments = [row for row in rows if row.cells[0].startswith("#") and row.number < end]
         comments += [TextRow(0, line.split(":")) for line in sidecar_text.splitlines()]
-        return cls(delimiter, decimal_comma, comments, data[:first], data[first:], numeric, source)
+        first_line = text.partition("\n")[0].replace('"', "").strip()
+        first_line = first_line if re.match(r"\W*[A-Za-z]", first_line) and data[:first] else ""
+        return cls(delimiter, decimal_comma, comments, data[:first], data[first:], numeric, source, first_line)
 
     @property
     def is_plain(self) -> bool:
@@ -288,6 +288,11 @@ class Header:
         """Return the number of rows that the header states, or None."""
         count = self.find_quantity(layouts.COUNT_KEYS)
         return int(count) if count is not None and count < 1e12 else None  # a larger number has another meaning
+
+    def count_segments(self) -> int:
+        """Return the number of segments that the header states, or 1."""
+        counts = [self._parse_quantity(text) for text in self.find_values(layouts.SEGMENT_KEYS)[:1]]
+        return int(counts[0]) if counts and counts[0] and 1.0 < counts[0] < 1e6 else 1
 
     def _find_names(self, count: int) -> list[str]:
         """Return channel names from lines such as "Source,CH1" or "Vertical Scale,CH1:0.05 CH2:0.10"."""

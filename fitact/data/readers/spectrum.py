@@ -104,10 +104,8 @@ def read_spectrum(path: str | os.PathLike[str], number: int | None = None, shunt
     """
     spectra = read_spectra(path, shunt)
     if number is None and len({spectrum.fingerprint for spectrum in spectra}) > 1:
-        raise InputError(
-            f"{os.fspath(path)}: holds {len(spectra)} spectra; choose one (--spectrum 1 to {len(spectra)})"
-        )
-    if not 1 <= (number or 1) <= len(spectra):
+        raise InputError(f"{os.fspath(path)}: holds {len(spectra)} spectra; choose one (--segment 1 to {len(spectra)})")
+    if number == 0 or not 1 <= (number or 1) <= len(spectra):
         raise InputError(f"{os.fspath(path)}: holds {len(spectra)} spectra, so there is no number {number}")
     return spectra[(number or 1) - 1]
 

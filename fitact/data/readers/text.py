@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import gzip
 import io
+import itertools
 import math
 import os
 import re
@@ -18,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.data.readers import layouts
-from fitact.data.readers.capture import Capture, FileChannel, Pick
+from fitact.data.readers.capture import Capture, FileChannel, Pick, choose_segment, select_segment
 from fitact.data.readers.header import MINUS, Column, Header, parse_number, read_header, split_cells
 from fitact.errors import InputError
 from fitact.files import read_error
@@ -33,31 +34,67 @@ _CLOCK = re.compile(
     rb"(?: ?([AaPp])[Mm]|Z|[+-]\d\d:?\d\d)?"
 )
 _DAY = 86_400.0  # s
+_SEGMENT = re.compile(r"Step Information:|Channels\t|\*\*\*End_of_Header")  # of LTspice, LabVIEW
 _THOUSANDS = re.compile(rb'"([-+]?\d{1,3}(?:,\d{3})+(?:\.\d*)?)"')
 MAX_FOOTER_LINES = 20  # more lines of words are no statistics below the data
 BLOCK_BYTES = 8_388_608  # parsed in one block
 
 
 def read_text(
-    path: Path, source: str, pick: Pick, rate: float | None = None, max_bytes: int = 4_294_967_296
+    path: Path,
+    source: str,
+    pick: Pick,
+    rate: float | None = None,
+    segment: int | None = None,
+    max_bytes: int = 4_294_967_296,
 ) -> Capture:
     """Return the columns of a text file (plain or gzip) that `pick` selects, in SI units.
 
-    `rate` (Hz) gives the times of a file that states none. Text of more than `max_bytes` is refused; it indicates a
-    damaged gzip file.
+    `rate` (Hz) gives the times of a file that states none, `segment` (from 1) chooses one of several. Text of more
+    than `max_bytes` is refused; it indicates a damaged gzip file.
     """
+    parts: list[tuple[bytes, int]] = []
     try:
         with _open_text(path, max_bytes) as (stream, file):
+            if segment is not None and len(parts := _split_segments(stream.read(max_bytes))) > 1:
+                stream = io.BytesIO(parts[select_segment(segment, len(parts), source)][0])
+            stream.seek(0)
             head = stream.read(_HEAD_BYTES)
             stream.seek(0)
             table = _TableParser.from_head(head.rstrip(PADDING), source, pick, read_sidecar(path), rate)
+            table.line_shift = parts[(segment or 1) - 1][1] if len(parts) > 1 else 0
             if stream is not file or not table.add_file(path):
                 blocks = _blocks(iter(lambda: stream.read(BLOCK_BYTES), b""), source, max_bytes)
                 for block in track_progress(blocks, f"reading {source}", path.stat().st_size, file.tell):
                     table.add(block)
+    except _SegmentsError:
+        with _open_text(path, max_bytes) as (stream, file):
+            select_segment(segment, max(2, len(_split_segments(stream.read(max_bytes)))), source)
+        raise
     except (OSError, EOFError, zlib.error) as error:
         raise read_error(source, error) from error
-    return table.to_capture()
+    capture = table.to_capture()
+    return capture if len(parts) > 1 else choose_segment(capture, segment, table.count_segments())
+
+
+class _SegmentsError(InputError):
+    """The rows of another segment follow."""
+
+
+def _split_segments(text: bytes) -> list[tuple[bytes, int]]:
+    """Return the segments of a text, each below the header of the file, with the number of lines left out between.
+
+    A segment begins where the first line of the file is repeated, or at the headers of LTspice and LabVIEW.
+    """
+    first = text.removeprefix(b"\xef\xbb\xbf").partition(b"\n")[0].rstrip()
+    repeated = re.escape(first) + rb"\s*$" if re.match(rb"\W*[A-Za-z]", first) else rb"(?!)"
+    for mark in (repeated, rb"Step Information:", rb"Channels\t"):
+        starts = [match.start() for match in re.finditer(rb"(?m)^(?:\xef\xbb\xbf)?" + mark, text)]
+        if len(starts) > 1:
+            header, edges = text[: starts[0]], itertools.pairwise([*starts, len(text)])
+            lines = header.count(b"\n")
+            return [(header + text[start:stop], text.count(b"\n", 0, start) - lines) for start, stop in edges]
+    return [(text, 0)]
 
 
 def stream_text(
@@ -173,6 +210,7 @@ class _TableParser:
         self._blank_rows: list[int] = []  # rows with a time but no values
         self._footer: list[tuple[int, str]] = []  # lines of words below the rows, with their numbers
         self._next_line = 1
+        self.line_shift = 0  # lines left out between header and rows
         self._has_thousands = False  # whether quoted numbers have commas between their thousands
         self._clock_start: float | None = None  # first time of day, s
         self._clock_end = 0.0  # last time since the first midnight, s
@@ -201,6 +239,7 @@ class _TableParser:
             if len(parts) <= skipped:
                 return
             first, block = first + skipped, parts[skipped]
+        first += self.line_shift
         block = _join_thousands(block) if self._has_thousands else block
         block = block.replace(b"\r", b"").replace(b'"', b"").rstrip(PADDING)
         block = block if block.isascii() else block.replace(MINUS.encode(), b"-")
@@ -283,6 +322,10 @@ class _TableParser:
             if not text.strip(delimiter + " ") or text.startswith("#"):
                 continue
             cells = split_cells(text, delimiter)
+            if _SEGMENT.match(text) or text.strip() == self._header.first_line:
+                raise _SegmentsError(
+                    f"{self._source}, line {line}: another segment begins ('{text[:60]}'); choose one, as --segment 1"
+                )
             is_word = bool(cells[0]) and parse_number(cells[0], self._header.decimal_comma) is None
             if self._has_time and is_word and (rows or self._starts[-1]):
                 self._footer.append((line, cells[0]))
@@ -306,11 +349,6 @@ class _TableParser:
 
     def _refuse_words(self, line: int, words: str) -> NoReturn:
         """Raise InputError for a line of words among rows of numbers."""
-        if re.match(r"Step Information|Channels|\*\*\*End_of_Header", words):  # LTspice, LabVIEW
-            raise InputError(
-                f"{self._source}, line {line}: holds several runs or segments, the next from '{words[:60]}' on; keep"
-                " one of them in the file, or export one"
-            )
         raise InputError(
             f"{self._source}, line {line}, column 1: '{words[:40]}' is not a number; correct or remove the row"
         )
@@ -325,6 +363,9 @@ class _TableParser:
     def _line_label(self, row: int) -> str:
         part = bisect.bisect_right(self._starts, row) - 1
         return f"line {self._lines[part][row - self._starts[part]]}"
+
+    def count_segments(self) -> int:
+        return self._header.count_segments()
 
     def to_capture(self) -> Capture:
         """Return the columns that were read."""
