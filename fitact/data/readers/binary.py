@@ -21,6 +21,7 @@ import numpy as np
 from fitact.data.readers import layouts
 from fitact.data.readers.capture import FULL_SCALE, Capture, FileChannel, Pick, choose_segment, select_segment
 from fitact.data.readers.matlab import read_mat
+from fitact.data.readers.spice import is_spice, read_spice
 from fitact.errors import InputError
 
 h5py, scipy = lazy_loader.load("h5py"), lazy_loader.load("scipy")
@@ -66,9 +67,7 @@ def read_binary(path: Path, source: str, head: bytes, pick: Pick, segment: int |
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # from parsers that continue after a problem
-            if reader is _read_scope:
-                return _read_scope(path, source, pick, segment)
-            return choose_segment(reader(path, source, pick), segment)
+            return reader(path, source, pick, segment)
     except InputError:
         raise
     except Exception as error:  # a dozen parsers with exceptions of their own
@@ -76,16 +75,20 @@ def read_binary(path: Path, source: str, head: bytes, pick: Pick, segment: int |
         raise InputError(f"{source}: cannot be read ({reason}); export the record again, or as CSV") from error
 
 
-def _find_reader(head: bytes, suffix: str) -> Callable[[Path, str, Pick], Capture] | None:
+def _find_reader(head: bytes, suffix: str) -> Callable[[Path, str, Pick, int | None], Capture] | None:
     readers = {
         b"\x89HDF\r\n\x1a\n": _read_hdf5, b"CDF": _read_netcdf3, b"TDSm": _read_tdms, b"PK\x03\x04": _read_npz,
         b"MATLAB 7.3": _read_hdf5, b"MATLAB": _read_mat, b"RIFF": _read_wav,
     }  # fmt: skip
-    scope = _read_scope if _SCOPE.search(head) or suffix.lower() in _SCOPE_SUFFIXES else None
-    return next((reader for start, reader in readers.items() if head.startswith(start)), scope)
+    if is_spice(head):
+        return read_spice
+    found = next((reader for start, reader in readers.items() if head.startswith(start)), None)
+    if found is None:
+        return _read_scope if _SCOPE.search(head) or suffix.lower() in _SCOPE_SUFFIXES else None
+    return lambda path, source, pick, segment: choose_segment(found(path, source, pick), segment)
 
 
-def _read_scope(path: Path, source: str, pick: Pick, segment: int | None = None) -> Capture:
+def _read_scope(path: Path, source: str, pick: Pick, segment: int | None) -> Capture:
     reader = _import_extra("RigolWFM.wfm", "scope", source).Wfm
     wfm = reader.from_file(str(path))
     if getattr(wfm, "frame_count", 1) > 1:  # FastFrame of Tektronix

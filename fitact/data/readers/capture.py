@@ -68,17 +68,24 @@ def select_segment(segment: int | None, count: int, source: str) -> int:
 
 
 def choose_segment(capture: Capture, segment: int | None, stated: int = 1) -> Capture:
-    """Return one of the segments of a capture: the runs in which the time starts anew, or `stated` equal parts."""
+    """Return one of the segments of a capture, from 1; see `split_segments`."""
+    parts = split_segments(capture, stated)
+    return parts[select_segment(segment, len(parts), capture.source)]
+
+
+def split_segments(capture: Capture, stated: int = 1) -> list[Capture]:
+    """Return the segments of a capture: the runs in which the time starts anew, or `stated` equal parts."""
+
+    def take(part: slice) -> Capture:
+        return dataclasses.replace(
+            capture,
+            time=capture.time[part],
+            channels=tuple(dataclasses.replace(each, values=each.values[part]) for each in capture.channels),
+            row_label=lambda row: capture.row_label(row + part.start),
+        )
+
     parts = _split_runs(capture.time, stated)
-    part = parts[select_segment(segment, len(parts), capture.source)]
-    if len(parts) == 1:
-        return capture
-    return dataclasses.replace(
-        capture,
-        time=capture.time[part],
-        channels=tuple(dataclasses.replace(each, values=each.values[part]) for each in capture.channels),
-        row_label=lambda row: capture.row_label(row + part.start),
-    )
+    return [capture] if len(parts) == 1 else [take(part) for part in parts]
 
 
 def _split_runs(time: Float[np.ndarray, " samples"], stated: int) -> list[slice]:

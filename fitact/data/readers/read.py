@@ -19,6 +19,7 @@ from fitact.data.readers.capture import (
 )
 from fitact.data.readers.layouts import is_same_grid
 from fitact.data.readers.spectrum import is_spectrum, read_spectrum
+from fitact.data.readers.spice import is_ac_analysis
 from fitact.data.readers.text import PADDING, is_binary, read_text
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.data.spectrum import Spectrum
@@ -106,10 +107,11 @@ def read_capture(
         raise InputError(f"{source}: the file holds no data; expected a header such as time_s,V_V,Vsc_V,I_A")
     if head[:2] == b"\x1f\x8b":
         return read_text(path, source, pick, rate, segment)
-    if is_binary(head.rstrip(PADDING)) or is_known_binary(head, path.suffix):
-        return read_binary(path, source, head, pick, segment)
-    if is_spectrum(path):
+    binary = is_binary(head.rstrip(PADDING)) or is_known_binary(head, path.suffix)
+    if is_ac_analysis(path) if binary else is_spectrum(path):
         raise SpectrumFileError(f"{source}: is a spectrum, without time, and this needs a record in time")
+    if binary:
+        return read_binary(path, source, head, pick, segment)
     return read_text(path, source, pick, rate, segment)
 
 

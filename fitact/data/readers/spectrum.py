@@ -5,13 +5,15 @@ import itertools
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Literal, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 
 from fitact.data.readers.header import parse_number, split_cells
-from fitact.data.spectrum import MINIMUM_POINTS, Spectrum
+from fitact.data.readers.spice import is_ac_analysis, read_ac_analyses
+from fitact.data.spectrum import MINIMUM_POINTS, ChannelName, Spectrum
 from fitact.errors import InputError
 from fitact.files import read_head
 from fitact.units import PREFIX_FACTORS, format_engineering
@@ -67,7 +69,7 @@ Rows = Float[np.ndarray, "points columns"]
 class _Layout(NamedTuple):
     """Meaning of the columns of a table."""
 
-    channel: Literal["impedance", "Vsc"]
+    channel: ChannelName
     places: tuple[int, ...]  # columns that must be numbers
     convert: Callable[[Rows], tuple[np.ndarray, np.ndarray]]  # of these columns to frequency (Hz) and response
     doubt: str = ""  # why the table might be two things
@@ -85,6 +87,8 @@ class _Table(NamedTuple):
 def is_spectrum(path: str | os.PathLike[str], head_size: int = 16_384, size: int = 2**22) -> bool:
     """Return whether a file holds a spectrum, by its layout; the numbers are bytes that are read."""
     try:
+        if is_ac_analysis(Path(path)):
+            return True
         content = read_head(path, head_size)
         lines = _split_lines(content)
         lines = lines[:-1] if len(content) == head_size else lines
@@ -124,7 +128,10 @@ def read_spectra(path: str | os.PathLike[str], shunt: float | None = None) -> tu
     """
     source, lines = os.fspath(path), _split_lines(read_head(path, 2**26))  # bytes, more than any spectrum has
     spectra: list[Spectrum] = []
-    for header in _find_headers(lines):
+    for rows, channel, note in read_ac_analyses(Path(path)) if is_ac_analysis(Path(path)) else ():
+        layout = _AC_LAYOUT._replace(channel=channel, note=note)
+        spectra += _to_spectra(layout, rows, source, shunt)
+    for header in [] if spectra else _find_headers(lines):
         if header.layout.doubt:
             raise InputError(f"{source}, line {header.end}: {header.layout.doubt}")
         spectra += _to_spectra(header.layout, np.array(list(_parse_rows(lines, header, source))), source, shunt)
