@@ -37,14 +37,21 @@ TOKENS = (
 
 def samples() -> dict[str, bytes]:
     """Return the files to damage: the shipped ones, and one of each kind with named arrays."""
+    from tests.data.test_layouts import LAYOUTS, SEGMENTED
     from tests.data.test_scope_files import NAMED
     from tests.data.test_spectrum import write_layouts
+    from tests.data.test_spice import FORMS, TIME, WAVES, ac, raw
+    from tests.data.test_spreadsheet import SHEETS, write_xlsx
 
     found = {path.name: path.read_bytes() for path in sorted(SCOPE.iterdir()) if path.suffix != ".md"}
     with tempfile.TemporaryDirectory() as folder:
         for name, write in NAMED.items():
             write(Path(folder) / name)
             found[name] = (Path(folder) / name).read_bytes()
+        found |= {f"{name}.csv": text.encode() for name, (text, _) in (LAYOUTS | SEGMENTED).items()}
+        found |= {f"{form}.raw": raw([(TIME, WAVES)], form, flags) for form, (flags, _) in FORMS.items()}
+        found |= {f"ac {form}.raw": ac(form, **{"V(skin)": np.linspace(0.1j, 0.2, 30)}) for form in ("mixed", "text")}
+        found["sheet.xlsx"] = write_xlsx(Path(folder) / "sheet.xlsx", SHEETS["names"][0]).read_bytes()
         spectra = write_layouts(Path(folder))
         spectra += [path for kind in ("bode", "impedance_py", "pyimpspec") for path in sorted((REAL / kind).glob("*"))]
         found |= {f"spectrum {path.name}": path.read_bytes() for path in spectra}
@@ -115,26 +122,29 @@ def _swap_lines(rng: random.Random, content: bytearray, other: bytes) -> None:
     content[:] = b"\n".join(lines)
 
 
-def outcome(path: Path) -> str:
-    """Return "spectrum", "record", "capture" or "refused" for a file; any other exception is raised."""
+def outcome(path: Path, segment: int | None = None) -> str:
+    """Return "spectrum", "record", "capture" or "refused" for a file; any other exception is raised.
+
+    Where a file holds several segments, the first is read.
+    """
     try:
         if is_spectrum(path):
             for spectrum in fitact.read_spectra(path):
                 assert np.all(np.isfinite(spectrum.values) & np.isfinite(spectrum.frequency))
                 assert np.all(np.diff(spectrum.frequency) > 0.0)
             return "spectrum"
-        capture = read_capture(path)
+        capture = read_capture(path, segment=segment)
         assert len({trace.values.size for trace in capture.channels} | {capture.time.size}) == 1
-        fitact.inspect(path)
+        fitact.inspect(path, segment=segment)
     except fitact.InputError as error:
         _one_sentence(error, path)
-        return "refused"
+        return outcome(path, 1) if segment is None and "--segment 1" in str(error) else "refused"
     names = [trace.name for trace in capture.channels]
     try:
         asked = {} if any(n.lower() == "vsc" for n in names) else {"Vsc": names[-1]}
         resolve_channels(names, asked, str(path))
         scene = fitact.Scene(drive={"waveform": "square"})
-        record = fitact.read(path, scene, channels=asked)
+        record = fitact.read(path, scene, channels=asked, segment=segment)
     except fitact.InputError as error:
         _one_sentence(error, path)
         return "capture"

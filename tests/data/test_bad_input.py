@@ -112,7 +112,7 @@ KINDS: dict[str, tuple] = {
     "binary of no known kind": ("refused", bare(bytes(range(256)) * 50), "neither a text file"),
     "broken gzip": ("refused", bare(b"\x1f\x8b broken"), "cannot be read"),
     "cut gzip": ("refused", lambda t: gzip.compress(text_of(t).encode())[:-500], "cannot be read"),
-    "spreadsheet": ("refused", bare(b"PK\x03\x04" + b"\0" * 100), "cannot be read"),
+    "damaged spreadsheet": ("refused", bare(b"PK\x03\x04" + b"\0" * 100), "cannot be read"),
     "cut file": ("refused", above("#Samples: 9999\n"), "states 9,999 rows, but the file has 4,000"),
     "several segments": ("refused", above("LECROYx,1,Waveform\nSegments,3,SegmentSize,400\n"), "holds 3 segments"),
     # the header

@@ -89,7 +89,7 @@ def _find_reader(head: bytes, suffix: str) -> Callable[[Path, str, Pick, int | N
 
 
 def _read_scope(path: Path, source: str, pick: Pick, segment: int | None) -> Capture:
-    reader = _import_extra("RigolWFM.wfm", "scope", source).Wfm
+    reader = import_extra("RigolWFM.wfm", "scope", source).Wfm
     wfm = reader.from_file(str(path))
     if getattr(wfm, "frame_count", 1) > 1:  # FastFrame of Tektronix
         wfm = reader.from_file(str(path), frame=select_segment(segment, wfm.frame_count, source))
@@ -141,7 +141,7 @@ def _read_wav(path: Path, source: str, pick: Pick) -> Capture:
 
 
 def _read_tdms(path: Path, source: str, pick: Pick) -> Capture:
-    nptdms = _import_extra("nptdms", "tdms", source)
+    nptdms = import_extra("nptdms", "tdms", source)
     with _capture_log("nptdms") as said, nptdms.TdmsFile.open(path) as file:
         pairs = [(group, channel) for group in file.groups() for channel in group.channels()]
         channels = {channel.name: channel for _, channel in pairs}
@@ -301,7 +301,7 @@ def _to_text(value: Any) -> str:
     return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
 
 
-def _import_extra(module: str, extra: str, source: str) -> types.ModuleType:
+def import_extra(module: str, extra: str, source: str) -> types.ModuleType:
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -60,9 +60,11 @@ class Capture:
 def select_segment(segment: int | None, count: int, source: str) -> int:
     """Return the index of a segment that is numbered from 1; None stands for the only one."""
     if segment is None and count > 1:
-        raise InputError(f"{source}: holds {count} segments (runs, steps or frames); choose one, as --segment 1")
+        raise InputError(
+            f"{source}: holds {count} segments (runs, steps, frames or sheets); choose one, as --segment 1"
+        )
     if not 1 <= (segment or 1) <= count or segment == 0:
-        held = f"{count} segments (runs, steps or frames)" if count > 1 else "one segment"
+        held = f"{count} segments (runs, steps, frames or sheets)" if count > 1 else "one segment"
         raise InputError(f"{source}: holds {held}, so there is no number {segment}")
     return (segment or 1) - 1
 

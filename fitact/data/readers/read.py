@@ -20,6 +20,7 @@ from fitact.data.readers.capture import (
 from fitact.data.readers.layouts import is_same_grid
 from fitact.data.readers.spectrum import is_spectrum, read_spectrum
 from fitact.data.readers.spice import is_ac_analysis
+from fitact.data.readers.spreadsheet import is_spreadsheet
 from fitact.data.readers.text import PADDING, is_binary, read_text
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.data.spectrum import Spectrum
@@ -108,6 +109,7 @@ def read_capture(
     if head[:2] == b"\x1f\x8b":
         return read_text(path, source, pick, rate, segment)
     binary = is_binary(head.rstrip(PADDING)) or is_known_binary(head, path.suffix)
+    binary = binary and not is_spreadsheet(path)
     if is_ac_analysis(path) if binary else is_spectrum(path):
         raise SpectrumFileError(f"{source}: is a spectrum, without time, and this needs a record in time")
     if binary:

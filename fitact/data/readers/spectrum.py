@@ -13,6 +13,7 @@ from jaxtyping import Complex, Float
 
 from fitact.data.readers.header import parse_number, split_cells
 from fitact.data.readers.spice import is_ac_analysis, read_ac_analyses
+from fitact.data.readers.spreadsheet import is_spreadsheet, read_sheets
 from fitact.data.spectrum import MINIMUM_POINTS, ChannelName, Spectrum
 from fitact.errors import InputError
 from fitact.files import read_head
@@ -89,11 +90,11 @@ def is_spectrum(path: str | os.PathLike[str], head_size: int = 16_384, size: int
     try:
         if is_ac_analysis(Path(path)):
             return True
-        content = read_head(path, head_size)
+        content = _read_text(path, head_size)
         lines = _split_lines(content)
         lines = lines[:-1] if len(content) == head_size else lines
         if _LATE_TABLES.search(lines[0] if lines else ""):
-            lines = _split_lines(read_head(path, size))
+            lines = _split_lines(_read_text(path, size))
         finders = _find_headers, _find_ac_analyses, _find_listings, _find_blocks
         return any(True for find in finders for _ in find(lines))
     except InputError:
@@ -126,7 +127,7 @@ def read_spectra(path: str | os.PathLike[str], shunt: float | None = None) -> tu
     Raises:
         InputError: the file cannot be read, or holds no spectrum; the message names the line and a remedy.
     """
-    source, lines = os.fspath(path), _split_lines(read_head(path, 2**26))  # bytes, more than any spectrum has
+    source, lines = os.fspath(path), _split_lines(_read_text(path, 2**26))  # bytes, more than any spectrum has
     spectra: list[Spectrum] = []
     for rows, channel, note in read_ac_analyses(Path(path)) if is_ac_analysis(Path(path)) else ():
         layout = _AC_LAYOUT._replace(channel=channel, note=note)
@@ -146,6 +147,10 @@ def read_spectra(path: str | os.PathLike[str], shunt: float | None = None) -> tu
             " header such as frequency_Hz,Z_real_ohm,Z_imag_ohm"
         )
     return tuple(spectra)
+
+
+def _read_text(path: str | os.PathLike[str], size: int) -> bytes:
+    return b"\n\n".join(read_sheets(Path(path)))[:size] if is_spreadsheet(Path(path)) else read_head(path, size)
 
 
 def _split_lines(content: bytes) -> list[str]:

@@ -21,6 +21,7 @@ from jaxtyping import Float
 from fitact.data.readers import layouts
 from fitact.data.readers.capture import Capture, FileChannel, Pick, choose_segment, select_segment
 from fitact.data.readers.header import MINUS, Column, Header, parse_number, read_header, split_cells
+from fitact.data.readers.spreadsheet import is_spreadsheet, read_sheets
 from fitact.errors import InputError
 from fitact.files import read_error
 from fitact.progress import track_progress
@@ -56,9 +57,9 @@ def read_text(
     parts: list[tuple[bytes, int]] = []
     try:
         with _open_text(path, max_bytes) as (stream, file):
-            if segment is not None and len(parts := _split_segments(stream.read(max_bytes))) > 1:
-                stream = io.BytesIO(parts[select_segment(segment, len(parts), source)][0])
-            stream.seek(0)
+            parts = _find_parts(path, stream, segment, max_bytes)
+            if parts:
+                stream = io.BytesIO(parts[select_segment(segment, len(parts), source) if len(parts) > 1 else 0][0])
             head = stream.read(_HEAD_BYTES)
             stream.seek(0)
             table = _TableParser.from_head(head.rstrip(PADDING), source, pick, read_sidecar(path), rate)
@@ -69,7 +70,7 @@ def read_text(
                     table.add(block)
     except _SegmentsError:
         with _open_text(path, max_bytes) as (stream, file):
-            select_segment(segment, max(2, len(_split_segments(stream.read(max_bytes)))), source)
+            select_segment(segment, max(2, len(_find_parts(path, stream, 1, max_bytes))), source)
         raise
     except (OSError, EOFError, zlib.error) as error:
         raise read_error(source, error) from error
@@ -79,6 +80,14 @@ def read_text(
 
 class _SegmentsError(InputError):
     """The rows of another segment follow."""
+
+
+def _find_parts(path: Path, stream: IO[bytes], segment: int | None, max_bytes: int) -> list[tuple[bytes, int]]:
+    """Return the sheets of a file, or the segments of its only sheet or text if one is asked for."""
+    if is_spreadsheet(path):
+        sheets = read_sheets(path)
+        return [(sheet, 0) for sheet in sheets] if len(sheets) > 1 or segment is None else _split_segments(sheets[0])
+    return [] if segment is None else _split_segments(stream.read(max_bytes))
 
 
 def _split_segments(text: bytes) -> list[tuple[bytes, int]]:
