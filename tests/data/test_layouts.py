@@ -87,6 +87,19 @@ LAYOUTS: dict[str, tuple[str, dict[str, object]]] = {
     "LabVIEW without times": (
         LVM.replace("One", "No") + "\n".join("\t" + row for row in rows(V, VSC, delimiter="\t")), {},
     ),
+    "LabVIEW with times of each channel": (
+        LVM.replace("V\tVsc", "V\tX_Value\tVsc") + "\n".join(rows(TIME, V, TIME, VSC, delimiter="\t")), {},
+    ),
+    "Origin": (
+        "Time\tV\tVsc\nus\tV\tV\nComments\tdrive\tskin\n" + "\n".join(rows(1e6 * TIME, V, VSC, delimiter="\t")), {},
+    ),
+    "columns that are aligned": (
+        "   Time [s]     Drive V [V]    Skin V [V]\n" + "\n".join(rows(TIME, V, VSC, form="%14.6f", delimiter=" ")),
+        {"channels": {"V": "Drive V", "Vsc": "Skin V"}},
+    ),
+    "a clock with colons only": (
+        with_clock("Time,V_V,Vsc_V", [clock.replace(".", ":") for clock in clocks()]), {},
+    ),
     "Yokogawa": (
         YOKOGAWA + "\n".join("," + row for row in rows(V, VSC)), {"channels": {"V": "CH1", "Vsc": "CH2"}},
     ),
@@ -148,6 +161,10 @@ REFUSED = {
     "no names": (rows(V, VSC), r"2 columns of numbers without names.*--rate 100kHz"),
     "a coarse clock": (
         with_clock("Time,V_V,Vsc_V", [c[:11] for c in clocks()]).splitlines(), r"resolution of 10 ms.*--rate 100kHz",
+    ),
+    "other times beside the first": (
+        [*LVM.replace("V\tVsc", "V\tX_Value\tVsc").splitlines(), *rows(TIME, V, 2.0 * TIME, VSC, delimiter="\t")],
+        r"the columns 1 and 3 hold different times; export channels of one time base",
     ),
     "words among rows": (
         insert("pause,,")(["time_s,V_V,Vsc_V", *rows(TIME, V, VSC)]), r"line 101, column 1: 'pause' is not a number",
@@ -337,7 +354,34 @@ def test_an_AC_analysis_of_LTspice_is_a_gain(form: str, tmp_path: Path):
     assert any("source of 1 V" in note for note in spectrum.notes)
 
 
-@pytest.mark.parametrize("code", ["9.9e37", "\N{INFINITY}"])
+def test_an_AC_analysis_of_several_voltages_and_steps(tmp_path: Path):
+    path, rng = tmp_path / "ac.txt", np.random.default_rng(0)
+    gain = (160e3 / (1.0 + 1j * OMEGA * 3.5e-3) / Z) * (1.0 + 1e-3 * rng.standard_normal(OMEGA.size))
+    current = 2.0 / Z
+
+    def cells(*columns: np.ndarray) -> list[str]:
+        return ["\t".join(f"{x.real:.15e},{x.imag:.15e}" for x in row) for row in zip(*columns, strict=True)]
+
+    def write(names: str, *steps: list[str]) -> None:
+        lines = ["Freq.\t" + names]
+        for number, step in enumerate(steps, 1):
+            lines += [f"Step Information: R={number}K  (Run: {number}/{len(steps)})"] * (len(steps) > 1)
+            lines += [f"{f:.15e}\t{cell}" for f, cell in zip(FREQUENCY, step, strict=True)]
+        path.write_text("\n".join(lines))
+
+    two = np.full(OMEGA.size, 2.0 + 0.0j)
+    write("V(in)\tV(skin)\tV(other)", cells(two, 2.0 * gain, gain))
+    np.testing.assert_allclose(fitact.read_spectrum(path).values, gain, rtol=1e-12)
+    write("V(in)\tV(a)\tV(b)\tI(V1)", cells(two, gain, gain, -current))
+    np.testing.assert_allclose(fitact.read_spectrum(path).values, Z, rtol=1e-12)
+    write("V(skin)", cells(gain), cells(0.5 * gain))
+    np.testing.assert_allclose(fitact.read_spectrum(path, 2).values, 0.5 * gain, rtol=1e-12)
+    write("V(in)\tV(a)\tV(b)", cells(two, gain, gain))
+    with pytest.raises(fitact.InputError, match=r"which of the voltages V\(a\), V\(b\) is that of the skin"):
+        fitact.read_spectra(path)
+
+
+@pytest.mark.parametrize("code", ["9.9e37", "\N{INFINITY}", "OL", "Overflow", "1.#INF"])
 def test_codes_for_values_out_of_range_are_clipped_samples(code: str, tmp_path: Path):
     """A single code in Vsc, or one in V, is refused."""
     path, beyond = tmp_path / "record.csv", np.abs(VSC) > 10.0

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from fitact.data.readers.header import parse_number, split_cells
-from fitact.data.readers.spice import is_ac_analysis, read_ac_analyses
+from fitact.data.readers.spice import Plot, find_response, is_ac_analysis, read_ac_analyses
 from fitact.data.readers.spreadsheet import is_spreadsheet, read_sheets
 from fitact.data.spectrum import MINIMUM_POINTS, ChannelName, Spectrum
 from fitact.errors import InputError
@@ -129,15 +129,14 @@ def read_spectra(path: str | os.PathLike[str], shunt: float | None = None) -> tu
     """
     source, lines = os.fspath(path), _split_lines(_read_text(path, 2**26))  # bytes, more than any spectrum has
     spectra: list[Spectrum] = []
-    for rows, channel, note in read_ac_analyses(Path(path)) if is_ac_analysis(Path(path)) else ():
-        layout = _AC_LAYOUT._replace(channel=channel, note=note)
+    plots = read_ac_analyses(Path(path)) if is_ac_analysis(Path(path)) else _find_ac_analyses(lines)
+    for rows, channel, note in (find_response(plot, source) for plot in plots):
+        layout = _Layout(channel, (0, 1, 2), lambda x: (x[:, 0], x[:, 1] + 1j * x[:, 2]), note=note)
         spectra += _to_spectra(layout, rows, source, shunt)
     for header in [] if spectra else _find_headers(lines):
         if header.layout.doubt:
             raise InputError(f"{source}, line {header.end}: {header.layout.doubt}")
         spectra += _to_spectra(header.layout, np.array(list(_parse_rows(lines, header, source))), source, shunt)
-    for gains in [] if spectra else _find_ac_analyses(lines):
-        spectra += _to_spectra(_AC_LAYOUT, gains, source, shunt)
     for find in (_find_listings, _find_blocks):
         for block in [] if spectra else find(lines):
             spectra += _to_spectra(_parts_layout((0, 1, 2), ("f", "Z'", "Z''")), block, source, shunt)
@@ -160,31 +159,31 @@ def _split_lines(content: bytes) -> list[str]:
         return content.decode("latin-1").splitlines()
 
 
-_AC_LAYOUT = _Layout(
-    "Vsc",
-    (0, 1, 2),
-    lambda x: (x[:, 0], x[:, 1] + 1j * x[:, 2]),
-    note="the gain is that of the AC analysis, for a source of 1 V",
-)
-
-
-def _find_ac_analyses(lines: Sequence[str]) -> Iterator[Rows]:
-    """Yield frequency, real and imaginary part of a voltage in an AC analysis that LTspice exports."""
-    if not lines or not re.match(r"Freq\.\t[^\t]+$", lines[0]):  # one voltage
+def _find_ac_analyses(lines: Sequence[str]) -> Iterator[Plot]:
+    """Yield the AC analysis of a text that LTspice exports, with the steps after one another."""
+    if not lines or not lines[0].startswith("Freq.\t"):
         return
-    number = r"([-+]?[\d.]+(?:[eE][-+]?\d+)?)"
-    polar, parts = (re.compile(rf"{number}\t{rest}") for rest in (rf"\({number}dB,{number}\S*\)", f"{number},{number}"))
+    names = lines[0].strip().split("\t")
     rows = []
     for line in filter(str.strip, lines[1:]):
-        if match := polar.fullmatch(line.strip()):
-            frequency, decibels, degrees = map(float, match.groups())
-            value = 10.0 ** (decibels / 20.0) * np.exp(1j * np.pi / 180.0 * degrees)
-            rows.append([frequency, value.real, value.imag])
-        elif match := parts.fullmatch(line.strip()):
-            rows.append([float(x) for x in match.groups()])
-        else:
-            return
-    yield np.array(rows, dtype=float).reshape(-1, 3)
+        if not line.startswith("Step Information:"):
+            frequency, *cells = line.strip().split("\t")
+            values = [parse_number(frequency, False), *map(_parse_complex, cells)]
+            if len(values) != len(names) or None in values:
+                return
+            rows.append(values)
+    kinds = ["device_current" if re.match(r"I[a-z]?\(", name) else "voltage" for name in names]
+    yield Plot(names, kinds, np.array(rows, dtype=complex).reshape(-1, len(names)), 0.0)
+
+
+def _parse_complex(cell: str) -> complex | None:
+    """Return a number that LTspice writes as (1.0dB,2.0°), or as its real and imaginary part."""
+    number = r"([-+]?[\d.]+(?:[eE][-+]?\d+)?)"
+    if match := re.fullmatch(rf"\({number}dB,{number}\S*\)", cell):
+        decibels, degrees = map(float, match.groups())
+        return complex(10.0 ** (decibels / 20.0) * np.exp(1j * np.pi / 180.0 * degrees))
+    match = re.fullmatch(f"{number},{number}", cell)
+    return complex(*map(float, match.groups())) if match else None
 
 
 def _find_listings(lines: Sequence[str]) -> Iterator[Rows]:

@@ -21,7 +21,7 @@ _WIDE = "Title:".encode("utf-16-le")
 _UNITS = {"voltage": "V", "current": "A", "device_current": "A", "subckt_current": "A"}
 
 
-class _Plot(NamedTuple):
+class Plot(NamedTuple):
     """One analysis: names and kinds of its variables, the first of which is the time or frequency, and their values."""
 
     names: list[str]
@@ -61,7 +61,7 @@ def read_spice(path: Path, source: str, pick: Pick, segment: int | None = None) 
     return runs[select_segment(segment, len(runs), source)]
 
 
-def _make_capture(plot: _Plot, source: str, pick: Pick) -> Capture:
+def _make_capture(plot: Plot, source: str, pick: Pick) -> Capture:
     names = plot.names[1:]
     wanted = set(pick(names, ""))
     # LTspice marks the points that are to be kept by the sign of their time
@@ -76,19 +76,19 @@ def _make_capture(plot: _Plot, source: str, pick: Pick) -> Capture:
     return Capture(source, "SPICE raw file", time, channels, unread_columns=unread)
 
 
-def read_ac_analyses(path: Path) -> list[tuple[np.ndarray, ChannelName, str]]:
-    """Return frequency, real and imaginary part (columns) of each AC analysis, whether it is a gain, and a note.
+def read_ac_analyses(path: Path) -> list[Plot]:
+    return [plot for plot in _read_plots(path) if plot.axis == "frequency"]
+
+
+def find_response(plot: Plot, source: str) -> tuple[np.ndarray, ChannelName, str]:
+    """Return frequency, real and imaginary part (columns) of an AC analysis, whether it is a gain, and a note.
 
     The drive is the voltage that is the same at all frequencies, or else a source of 1 V. The response is the voltage
     of a node named vsc or skin, the impedance at the only voltage source, or the only other voltage.
 
     Raises:
-        InputError: the file is damaged, or none of these is there.
+        InputError: none of these is there.
     """
-    return [_find_response(plot, str(path)) for plot in _read_plots(path) if plot.axis == "frequency"]
-
-
-def _find_response(plot: _Plot, source: str) -> tuple[np.ndarray, ChannelName, str]:
     frequency, columns = plot.values[:, 0].real, dict(zip(plot.names[1:], plot.values[:, 1:].T, strict=True))
     kinds = dict(zip(plot.names, plot.kinds, strict=True))
     voltages = {name: each for name, each in columns.items() if kinds[name] == "voltage"}
@@ -113,9 +113,9 @@ def _find_response(plot: _Plot, source: str) -> tuple[np.ndarray, ChannelName, s
     return np.column_stack([frequency, values.real, values.imag]), kind, note
 
 
-def _read_plots(path: Path) -> list[_Plot]:
+def _read_plots(path: Path) -> list[Plot]:
     source, content = str(path), path.read_bytes()
-    plots: list[_Plot] = []
+    plots: list[Plot] = []
     try:
         while content.strip(b"\r\n\0 ") and (not plots or is_spice(content)):
             plot, content = _read_plot(content)
@@ -126,7 +126,7 @@ def _read_plots(path: Path) -> list[_Plot]:
     return plots
 
 
-def _read_plot(content: bytes) -> tuple[_Plot, bytes]:
+def _read_plot(content: bytes) -> tuple[Plot, bytes]:
     """Return the first plot, and what follows it; raise ValueError for damage."""
     encoding = "utf-16-le" if content.startswith(_WIDE) else "latin-1"
     marks = {kind: content.find(f"\n{kind}:".encode(encoding)) for kind in ("Binary", "Values")}
@@ -147,7 +147,7 @@ def _read_plot(content: bytes) -> tuple[_Plot, bytes]:
         values, rest = _parse_binary(body, points, count, "complex" in flags, "fastaccess" in flags)
     else:
         values, rest = _parse_text(body, points, count, encoding)
-    return _Plot(names, kinds, values, float(keys.get("offset", 0.0))), rest
+    return Plot(names, kinds, values, float(keys.get("offset", 0.0))), rest
 
 
 def _parse_binary(

@@ -31,7 +31,7 @@ PADDING = b"\x00\x1a"  # that some programs write after the text
 _HEAD_BYTES = 32_768  # bytes; enough for any header and some rows
 # a time of day, after which date it may stand; the date counts only by its midnights
 _CLOCK = re.compile(
-    rb"(?:\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}[ T])?(?<!\d)(\d{1,2}):(\d\d):(\d\d(?:\.\d+|,\d+(?=[;\t]))?)"
+    rb"(?:\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}[ T])?(?<!\d)(\d{1,2}):(\d\d):(\d\d(?:\.\d+|:\d{3}(?:\d{3})?|,\d+(?=[;\t]))?)"
     rb"(?: ?([AaPp])[Mm]|Z|[+-]\d\d:?\d\d)?"
 )
 _DAY = 86_400.0  # s
@@ -183,8 +183,9 @@ def _decode(head: bytes, source: str) -> str:
 def _write_seconds(clock: re.Match[bytes]) -> bytes:
     """Return a time of day as seconds since midnight."""
     hours, minutes, seconds, half = clock.groups()
+    seconds = re.sub(rb"[,:]", b".", seconds)
     hour = int(hours) if half is None else int(hours) % 12 + 12 * (half in b"Pp")
-    return b"%.9f" % (3600.0 * hour + 60.0 * int(minutes) + float(seconds.replace(b",", b".")))
+    return b"%.9f" % (3600.0 * hour + 60.0 * int(minutes) + float(seconds))
 
 
 def _join_thousands(text: bytes) -> bytes:
