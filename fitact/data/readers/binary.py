@@ -5,11 +5,9 @@ Optional parsers are imported where they are used. Any error of a parser becomes
 
 import contextlib
 import dataclasses
-import importlib
 import io
 import logging
 import re
-import types
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -19,8 +17,10 @@ import lazy_loader
 import numpy as np
 
 from fitact.data.readers import layouts
-from fitact.data.readers.capture import FULL_SCALE, Capture, FileChannel, Pick, choose_segment, select_segment
+from fitact.data.readers.capture import FULL_SCALE, Capture, FileChannel, Pick
+from fitact.data.readers.extras import import_extra
 from fitact.data.readers.matlab import read_mat
+from fitact.data.readers.segments import choose_segment, select_segment
 from fitact.data.readers.spice import is_spice, read_spice
 from fitact.errors import InputError
 
@@ -299,13 +299,3 @@ def _check_size(size: int, path: Path, source: str) -> None:
 
 def _to_text(value: Any) -> str:
     return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
-
-
-def import_extra(module: str, extra: str, source: str) -> types.ModuleType:
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise InputError(
-            f"{source}: needs {module.partition('.')[0]}, which is not installed; pip install 'fitact[{extra}]', or"
-            " export the record as CSV"
-        ) from error

@@ -1,7 +1,6 @@
 """Contents of a file before channels are assigned: time, and channels with the names in the file."""
 
 import dataclasses
-import itertools
 import math
 import shlex
 from collections.abc import Callable, Iterable, Mapping
@@ -10,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.data.readers.layouts import normalize_channel, parse_unit
-from fitact.data.record import CHANNEL_UNITS, MINIMUM_SAMPLES, Record, is_rounded_grid
+from fitact.data.record import CHANNEL_UNITS, Record, is_rounded_grid
 from fitact.errors import InputError
 from fitact.units import format_engineering
 
@@ -55,50 +54,6 @@ class Capture:
     notes: tuple[str, ...] = ()  # sentences for information
     warnings: tuple[str, ...] = ()  # sentences on what was assumed and may change the result
     unread_columns: tuple[str, ...] = ()  # columns that were not requested, or without numbers
-
-
-def select_segment(segment: int | None, count: int, source: str) -> int:
-    """Return the index of a segment that is numbered from 1; None stands for the only one."""
-    if segment is None and count > 1:
-        raise InputError(
-            f"{source}: holds {count} segments (runs, steps, frames or sheets); choose one, as --segment 1"
-        )
-    if not 1 <= (segment or 1) <= count or segment == 0:
-        held = f"{count} segments (runs, steps, frames or sheets)" if count > 1 else "one segment"
-        raise InputError(f"{source}: holds {held}, so there is no number {segment}")
-    return (segment or 1) - 1
-
-
-def choose_segment(capture: Capture, segment: int | None, stated: int = 1) -> Capture:
-    """Return one of the segments of a capture, from 1; see `split_segments`."""
-    parts = split_segments(capture, stated)
-    return parts[select_segment(segment, len(parts), capture.source)]
-
-
-def split_segments(capture: Capture, stated: int = 1) -> list[Capture]:
-    """Return the segments of a capture: the runs in which the time starts anew, or `stated` equal parts."""
-
-    def take(part: slice) -> Capture:
-        return dataclasses.replace(
-            capture,
-            time=capture.time[part],
-            channels=tuple(dataclasses.replace(each, values=each.values[part]) for each in capture.channels),
-            row_label=lambda row: capture.row_label(row + part.start),
-        )
-
-    parts = _split_runs(capture.time, stated)
-    return [capture] if len(parts) == 1 else [take(part) for part in parts]
-
-
-def _split_runs(time: Float[np.ndarray, " samples"], stated: int) -> list[slice]:
-    starts = np.flatnonzero(time[1:] < time[:-1]) + 1
-    edges = np.concatenate([[0], starts, [time.size]])
-    is_short = np.min(np.diff(edges)) < MINIMUM_SAMPLES
-    # after a few rows out of order, others follow the rows before
-    if not starts.size or is_short or not np.all(time[starts + MINIMUM_SAMPLES - 1] <= time[starts - 1]):
-        edges = np.arange(stated + 1) * (time.size // stated)
-        edges[-1] = time.size
-    return [slice(int(start), int(stop)) for start, stop in itertools.pairwise(edges)]
 
 
 def resolve_channels(names: list[str], channels: Mapping[str, str], source: str, location: str = "") -> dict[str, str]:

@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitact.data.readers.capture import Capture, FileChannel, Pick, select_segment, split_segments
+from fitact.data.readers.capture import Capture, FileChannel, Pick
+from fitact.data.readers.segments import select_segment, split_segments
 from fitact.data.spectrum import ChannelName
 from fitact.errors import InputError
 from fitact.files import read_head

@@ -7,7 +7,7 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-from fitact.data.readers.binary import import_extra
+from fitact.data.readers.extras import import_extra
 from fitact.data.spectrum import MINIMUM_POINTS
 from fitact.errors import InputError
 from fitact.files import read_head

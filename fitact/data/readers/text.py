@@ -6,7 +6,6 @@ import csv
 import dataclasses
 import gzip
 import io
-import itertools
 import math
 import os
 import re
@@ -19,9 +18,9 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.data.readers import layouts
-from fitact.data.readers.capture import Capture, FileChannel, Pick, choose_segment, select_segment
+from fitact.data.readers.capture import Capture, FileChannel, Pick
 from fitact.data.readers.header import MINUS, Column, Header, parse_number, read_header, split_cells
-from fitact.data.readers.spreadsheet import is_spreadsheet, read_sheets
+from fitact.data.readers.segments import SEGMENT, SegmentsError, choose_segment, find_parts, select_segment
 from fitact.errors import InputError
 from fitact.files import read_error
 from fitact.progress import track_progress
@@ -35,7 +34,6 @@ _CLOCK = re.compile(
     rb"(?: ?([AaPp])[Mm]|Z|[+-]\d\d:?\d\d)?"
 )
 _DAY = 86_400.0  # s
-_SEGMENT = re.compile(r"Step Information:|Channels\t|\*\*\*End_of_Header")  # of LTspice, LabVIEW
 _THOUSANDS = re.compile(rb'"([-+]?\d{1,3}(?:,\d{3})+(?:\.\d*)?)"')
 MAX_FOOTER_LINES = 20  # more lines of words are no statistics below the data
 BLOCK_BYTES = 8_388_608  # parsed in one block
@@ -57,7 +55,7 @@ def read_text(
     parts: list[tuple[bytes, int]] = []
     try:
         with _open_text(path, max_bytes) as (stream, file):
-            parts = _find_parts(path, stream, segment, max_bytes)
+            parts = find_parts(path, stream, segment, max_bytes)
             if parts:
                 stream = io.BytesIO(parts[select_segment(segment, len(parts), source) if len(parts) > 1 else 0][0])
             head = stream.read(_HEAD_BYTES)
@@ -68,42 +66,14 @@ def read_text(
                 blocks = _blocks(iter(lambda: stream.read(BLOCK_BYTES), b""), source, max_bytes)
                 for block in track_progress(blocks, f"reading {source}", path.stat().st_size, file.tell):
                     table.add(block)
-    except _SegmentsError:
+    except SegmentsError:
         with _open_text(path, max_bytes) as (stream, file):
-            select_segment(segment, max(2, len(_find_parts(path, stream, 1, max_bytes))), source)
+            select_segment(segment, max(2, len(find_parts(path, stream, 1, max_bytes))), source)
         raise
     except (OSError, EOFError, zlib.error) as error:
         raise read_error(source, error) from error
     capture = table.to_capture()
     return capture if len(parts) > 1 else choose_segment(capture, segment, table.count_segments())
-
-
-class _SegmentsError(InputError):
-    """The rows of another segment follow."""
-
-
-def _find_parts(path: Path, stream: IO[bytes], segment: int | None, max_bytes: int) -> list[tuple[bytes, int]]:
-    """Return the sheets of a file, or the segments of its only sheet or text if one is asked for."""
-    if is_spreadsheet(path):
-        sheets = read_sheets(path)
-        return [(sheet, 0) for sheet in sheets] if len(sheets) > 1 or segment is None else _split_segments(sheets[0])
-    return [] if segment is None else _split_segments(stream.read(max_bytes))
-
-
-def _split_segments(text: bytes) -> list[tuple[bytes, int]]:
-    """Return the segments of a text, each below the header of the file, with the number of lines left out between.
-
-    A segment begins where the first line of the file is repeated, or at the headers of LTspice and LabVIEW.
-    """
-    first = text.removeprefix(b"\xef\xbb\xbf").partition(b"\n")[0].rstrip()
-    repeated = re.escape(first) + rb"\s*$" if re.match(rb"\W*[A-Za-z]", first) else rb"(?!)"
-    for mark in (repeated, rb"Step Information:", rb"Channels\t"):
-        starts = [match.start() for match in re.finditer(rb"(?m)^(?:\xef\xbb\xbf)?" + mark, text)]
-        if len(starts) > 1:
-            header, edges = text[: starts[0]], itertools.pairwise([*starts, len(text)])
-            lines = header.count(b"\n")
-            return [(header + text[start:stop], text.count(b"\n", 0, start) - lines) for start, stop in edges]
-    return [(text, 0)]
 
 
 def stream_text(
@@ -332,8 +302,8 @@ class _TableParser:
             if not text.strip(delimiter + " ") or text.startswith("#"):
                 continue
             cells = split_cells(text, delimiter)
-            if _SEGMENT.match(text) or text.strip() == self._header.first_line:
-                raise _SegmentsError(
+            if SEGMENT.match(text) or text.strip() == self._header.first_line:
+                raise SegmentsError(
                     f"{self._source}, line {line}: another segment begins ('{text[:60]}'); choose one, as --segment 1"
                 )
             is_word = bool(cells[0]) and parse_number(cells[0], self._header.decimal_comma) is None
