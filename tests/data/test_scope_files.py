@@ -204,6 +204,29 @@ def test_lecroy_binary_against_its_descriptor():
 
 
 @pytest.mark.usefixtures("rigolwfm")
+def test_segmented_memory_of_keysight(tmp_path: Path):
+    """Manual: each segment of a channel has headers of 140 + 12 bytes, with the number of the segment at 136."""
+    content, path = (SCOPE / "agilent_1.bin").read_bytes(), tmp_path / "segments.bin"
+    samples = floats(SCOPE / "agilent_1.bin", 164, 2000)
+    waves = [np.roll(samples, 7 * i).astype("<f4") for i in range(6)]
+    parts = [
+        content[12:124] + str(i % 2 + 1).encode() + content[125:148] + struct.pack("<I", i // 2 + 1) + content[152:164]
+        + wave.tobytes()
+        for i, wave in enumerate(waves)
+    ]  # fmt: skip
+    body = b"".join(parts)
+    path.write_bytes(content[:4] + struct.pack("<II", 12 + len(body), 6) + body)
+    with pytest.raises(fitact.InputError, match=r"holds 3 segments .* choose one, as --segment 1"):
+        read_capture(path)
+    for number in (1, 2, 3):
+        capture = read_capture(path, segment=number)
+        assert [(each.name, each.unit) for each in capture.channels] == [("CH 1", "V"), ("CH 2", "V")]
+        for i, channel in enumerate(capture.channels):
+            np.testing.assert_array_equal(channel.values, waves[2 * number - 2 + i])
+        np.testing.assert_allclose(capture.time, read_capture(SCOPE / "agilent_1.bin").time, atol=1e-12)
+
+
+@pytest.mark.usefixtures("rigolwfm")
 def test_frames_of_tektronix_binary(monkeypatch):
     """RigolWFM reads one frame of a FastFrame capture at a time, and counts them."""
     wfm = importlib.import_module("RigolWFM.wfm")

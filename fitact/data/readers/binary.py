@@ -23,6 +23,7 @@ from fitact.data.readers.matlab import read_mat
 from fitact.data.readers.segments import choose_segment, select_segment
 from fitact.data.readers.spice import is_spice, read_spice
 from fitact.errors import InputError
+from fitact.files import read_head
 
 h5py, scipy = lazy_loader.load("h5py"), lazy_loader.load("scipy")
 
@@ -90,6 +91,8 @@ def _find_reader(head: bytes, suffix: str) -> Callable[[Path, str, Pick, int | N
 
 def _read_scope(path: Path, source: str, pick: Pick, segment: int | None) -> Capture:
     reader = import_extra("RigolWFM.wfm", "scope", source).Wfm
+    if read_head(path, 2) == b"AG" and (capture := _read_keysight_segment(path, source, pick, segment)):
+        return capture
     wfm = reader.from_file(str(path))
     if getattr(wfm, "frame_count", 1) > 1:  # FastFrame of Tektronix
         wfm = reader.from_file(str(path), frame=select_segment(segment, wfm.frame_count, source))
@@ -114,9 +117,30 @@ def _read_scope(path: Path, source: str, pick: Pick, segment: int | None) -> Cap
     return dataclasses.replace(parts, time=times[0][: parts.time.size])  # since the trigger of the segment
 
 
+def _read_keysight_segment(path: Path, source: str, pick: Pick, segment: int | None) -> Capture | None:
+    """Return one segment of Keysight's segmented memory, which RigolWFM parses but does not convert, or None."""
+    contents = import_extra("RigolWFM.agilent_agxx_bin", "scope", source).AgilentAgxxBin.from_file(str(path))
+    floats = [each for each in contents.waveforms if each.buffers and each.buffers[0].data_header.buffer_type == 1]
+    numbers = sorted({each.wfm_header.segment_index for each in floats})
+    if numbers in ([], [0]):
+        return None
+    number = numbers[select_segment(segment, len(numbers), source)]
+    here = [each for each in floats if each.wfm_header.segment_index == number]
+    chosen = {f"CH {each.wfm_header.waveform_label.strip()}": each for each in here}
+    wanted = [name for name in chosen if name in set(pick(list(chosen), ""))]
+    units, header = {1: "V", 4: "A"}, chosen[wanted[0]].wfm_header
+    values = {name: np.frombuffer(chosen[name].buffers[0].data_raw, "<f4").astype(float) for name in wanted}
+    channels = [FileChannel(name, values[name], units.get(int(chosen[name].wfm_header.y_units), "")) for name in wanted]
+    time = header.x_origin + header.x_increment * np.arange(header.n_pts)
+    for name in wanted:
+        if values[name].size != time.size:
+            raise InputError(f"{source}: {name} has {values[name].size:,} of {time.size:,} samples; export it again")
+    return Capture(source, "Keysight", time, tuple(channels), unread_columns=tuple(set(chosen) - set(wanted)))
+
+
 def _count_sequence(path: Path, place: int = 144) -> int:
     """Return the number of segments in LeCroy's sequence mode, `place` bytes into its WAVEDESC, or 1."""
-    _, mark, block = path.read_bytes().partition(b"WAVEDESC")
+    _, mark, block = read_head(path).partition(b"WAVEDESC")
     start = place - len(mark)
     order: Literal["little", "big"] = "little" if block[34 - len(mark) : 35 - len(mark)] == b"\1" else "big"
     return int.from_bytes(block[start : start + 4], order) if mark and block[8:].startswith(b"LECROY_2") else 1
