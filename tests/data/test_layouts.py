@@ -376,6 +376,16 @@ def test_an_AC_analysis_of_several_voltages_and_steps(tmp_path: Path):
     np.testing.assert_allclose(fitact.read_spectrum(path).values, Z, rtol=1e-12)
     write("V(skin)", cells(gain), cells(0.5 * gain))
     np.testing.assert_allclose(fitact.read_spectrum(path, 2).values, 0.5 * gain, rtol=1e-12)
+    table = np.column_stack([FREQUENCY, two.real, two.imag, FREQUENCY, 2.0 * gain.real, 2.0 * gain.imag])
+    for chosen, names in (
+        ([0, 1, 2, 3, 4, 5], "frequency v(in) v(in) frequency v(out) v(out)"),
+        ([0, 1, 2, 4, 5], "frequency v(in) v(in) v(out) v(out)"),
+    ):
+        lines = rows(*table[:, chosen].T, form="%.14e", delimiter="  ")
+        path.write_text("\n".join([names, *lines, names, *lines]))
+        found = fitact.read_spectra(path)
+        assert len(found) == 2
+        np.testing.assert_allclose(found[1].values, gain, rtol=1e-12)
     write("V(in)\tV(a)\tV(b)", cells(two, gain, gain))
     with pytest.raises(fitact.InputError, match=r"which of the voltages V\(a\), V\(b\) is that of the skin"):
         fitact.read_spectra(path)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from fitact.data.readers.header import parse_number, split_cells
-from fitact.data.readers.spice import Plot, find_response, is_ac_analysis, read_ac_analyses
+from fitact.data.readers.spice import find_ac_analyses, find_response, is_ac_analysis, read_ac_analyses
 from fitact.data.readers.spreadsheet import is_spreadsheet, read_sheets
 from fitact.data.spectrum import MINIMUM_POINTS, ChannelName, Spectrum
 from fitact.errors import InputError
@@ -95,7 +95,7 @@ def is_spectrum(path: str | os.PathLike[str], head_size: int = 16_384, size: int
         lines = lines[:-1] if len(content) == head_size else lines
         if _LATE_TABLES.search(lines[0] if lines else ""):
             lines = _split_lines(_read_text(path, size))
-        finders = _find_headers, _find_ac_analyses, _find_listings, _find_blocks
+        finders = _find_headers, find_ac_analyses, _find_listings, _find_blocks
         return any(True for find in finders for _ in find(lines))
     except InputError:
         return False
@@ -129,7 +129,7 @@ def read_spectra(path: str | os.PathLike[str], shunt: float | None = None) -> tu
     """
     source, lines = os.fspath(path), _split_lines(_read_text(path, 2**26))  # bytes, more than any spectrum has
     spectra: list[Spectrum] = []
-    plots = read_ac_analyses(Path(path)) if is_ac_analysis(Path(path)) else _find_ac_analyses(lines)
+    plots = read_ac_analyses(Path(path)) if is_ac_analysis(Path(path)) else find_ac_analyses(lines)
     for rows, channel, note in (find_response(plot, source) for plot in plots):
         layout = _Layout(channel, (0, 1, 2), lambda x: (x[:, 0], x[:, 1] + 1j * x[:, 2]), note=note)
         spectra += _to_spectra(layout, rows, source, shunt)
@@ -157,33 +157,6 @@ def _split_lines(content: bytes) -> list[str]:
         return content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig").splitlines()
     except UnicodeDecodeError:
         return content.decode("latin-1").splitlines()
-
-
-def _find_ac_analyses(lines: Sequence[str]) -> Iterator[Plot]:
-    """Yield the AC analysis of a text that LTspice exports, with the steps after one another."""
-    if not lines or not lines[0].startswith("Freq.\t"):
-        return
-    names = lines[0].strip().split("\t")
-    rows = []
-    for line in filter(str.strip, lines[1:]):
-        if not line.startswith("Step Information:"):
-            frequency, *cells = line.strip().split("\t")
-            values = [parse_number(frequency, False), *map(_parse_complex, cells)]
-            if len(values) != len(names) or None in values:
-                return
-            rows.append(values)
-    kinds = ["device_current" if re.match(r"I[a-z]?\(", name) else "voltage" for name in names]
-    yield Plot(names, kinds, np.array(rows, dtype=complex).reshape(-1, len(names)), 0.0)
-
-
-def _parse_complex(cell: str) -> complex | None:
-    """Return a number that LTspice writes as (1.0dB,2.0°), or as its real and imaginary part."""
-    number = r"([-+]?[\d.]+(?:[eE][-+]?\d+)?)"
-    if match := re.fullmatch(rf"\({number}dB,{number}\S*\)", cell):
-        decibels, degrees = map(float, match.groups())
-        return complex(10.0 ** (decibels / 20.0) * np.exp(1j * np.pi / 180.0 * degrees))
-    match = re.fullmatch(f"{number},{number}", cell)
-    return complex(*map(float, match.groups())) if match else None
 
 
 def _find_listings(lines: Sequence[str]) -> Iterator[Rows]:

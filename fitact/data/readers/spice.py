@@ -6,12 +6,14 @@ variable is stored by itself (fastaccess). The library that reads these files, s
 """
 
 import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from fitact.data.readers.capture import Capture, FileChannel, Pick
+from fitact.data.readers.header import parse_number
 from fitact.data.readers.segments import select_segment, split_segments
 from fitact.data.spectrum import ChannelName
 from fitact.errors import InputError
@@ -79,6 +81,41 @@ def _make_capture(plot: Plot, source: str, pick: Pick) -> Capture:
 
 def read_ac_analyses(path: Path) -> list[Plot]:
     return [plot for plot in _read_plots(path) if plot.axis == "frequency"]
+
+
+def find_ac_analyses(lines: Sequence[str]) -> Iterator[Plot]:
+    """Yield the AC analysis of a text by LTspice, or by wrdata of ngspice with wr_vecnames, with steps below it."""
+    names = lines[0].split() if lines else []
+    pairs = [i for i in range(1, len(names) - 1) if names[i] == names[i + 1] != names[i - 1]]  # real, imaginary part
+    if names[:1] == ["Freq."]:
+        names, pairs = lines[0].strip().split("\t"), []
+    elif names[:1] != ["frequency"] or not pairs:
+        return
+    rows = []
+    for line in lines[1:]:
+        if not line.strip() or line == lines[0] or line.startswith("Step Information:"):
+            continue
+        cells = line.split() if pairs else line.strip().split("\t")
+        numbers = [
+            parse_number(cell, False) if pairs or not i else _parse_complex(cell) for i, cell in enumerate(cells)
+        ]
+        if len(numbers) != len(names) or None in numbers:
+            return
+        values = np.array(numbers, dtype=complex)
+        rows.append([values[0], *(values[i] + 1j * values[i + 1] for i in pairs)] if pairs else values)
+    names = [names[0], *(names[i] for i in pairs)] if pairs else names
+    kinds = ["device_current" if re.match(r"[Ii][a-z]?\(", name) else "voltage" for name in names]
+    yield Plot(names, kinds, np.array(rows, dtype=complex).reshape(-1, len(names)), 0.0)
+
+
+def _parse_complex(cell: str) -> complex | None:
+    """Return a number that LTspice writes as (1.0dB,2.0°), or as its real and imaginary part."""
+    number = r"([-+]?[\d.]+(?:[eE][-+]?\d+)?)"
+    if match := re.fullmatch(rf"\({number}dB,{number}\S*\)", cell):
+        decibels, degrees = map(float, match.groups())
+        return complex(10.0 ** (decibels / 20.0) * np.exp(1j * np.pi / 180.0 * degrees))
+    match = re.fullmatch(f"{number},{number}", cell)
+    return complex(*map(float, match.groups())) if match else None
 
 
 def find_response(plot: Plot, source: str) -> tuple[np.ndarray, ChannelName, str]:

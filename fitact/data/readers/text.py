@@ -272,7 +272,8 @@ class _TableParser:
         if self._header.decimal_comma:
             block = block.replace(b",", b".")
         if len(block) > large:
-            return self._parse_large(io.BytesIO(block), usecols=sorted(set(self._column_indices)), dtype=float)
+            places = sorted(set(self._column_indices))
+            return self._parse_large(io.BytesIO(block), usecols=places, dtype=float, encoding="latin-1")
         try:
             return np.loadtxt(
                 io.BytesIO(block), delimiter=delimiter, ndmin=2, comments=None, usecols=self._column_indices,
