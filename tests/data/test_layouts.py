@@ -61,6 +61,11 @@ LAYOUTS: dict[str, tuple[str, dict[str, object]]] = {
     "a German clock": (
         with_clock("Zeit;V_V;Vsc_V", clocks(), delimiter=";").replace(".", ","), {},
     ),
+    "a date with the name of its month": (with_clock("when,V_V,Vsc_V", [f"04-Mar-2025 {c}" for c in clocks()]), {}),
+    "minutes and seconds of Excel and a rate": (
+        with_clock("Time,V_V,Vsc_V", [c[3:10] for c in clocks(begin=100.0)]), {"rate": 1.0 / STEP},
+    ),
+    "minutes and seconds": (with_clock("Time,V_V,Vsc_V", [c[3:] for c in clocks(begin=100.0)]), {}),
     "a coarse clock and a rate": (
         with_clock("Time,V_V,Vsc_V", [c[:8] for c in clocks(begin=100.0)]), {"rate": 1.0 / STEP},
     ),

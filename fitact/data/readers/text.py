@@ -30,7 +30,8 @@ PADDING = b"\x00\x1a"  # that some programs write after the text
 _HEAD_BYTES = 32_768  # bytes; enough for any header and some rows
 # a time of day, after which date it may stand; the date counts only by its midnights
 _CLOCK = re.compile(
-    rb"(?:\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}[ T])?(?<!\d)(\d{1,2}):(\d\d):(\d\d(?:\.\d+|:\d{3}(?:\d{3})?|,\d+(?=[;\t]))?)"
+    rb"(?:(?:\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}|\d{1,2}[- ][A-Za-z]{3}[- ]\d{2,4})[ T])?"
+    rb"(?<![\d:])(?:(\d{1,2}):)?(\d\d):(\d\d(?:\.\d+|:\d{3}(?:\d{3})?|,\d+(?=[;\t]))?)"
     rb"(?: ?([AaPp])[Mm]|Z|[+-]\d\d:?\d\d)?"
 )
 _DAY = 86_400.0  # s
@@ -153,6 +154,10 @@ def _decode(head: bytes, source: str) -> str:
 def _write_seconds(clock: re.Match[bytes]) -> bytes:
     """Return a time of day as seconds since midnight."""
     hours, minutes, seconds, half = clock.groups()
+    if hours is None:  # as Excel shows times, with minutes, seconds and decimals
+        if not re.search(rb"[.,]", seconds):
+            return clock[0]
+        hours = b"0"
     seconds = re.sub(rb"[,:]", b".", seconds)
     hour = int(hours) if half is None else int(hours) % 12 + 12 * (half in b"Pp")
     return b"%.9f" % (3600.0 * hour + 60.0 * int(minutes) + float(seconds))
@@ -202,7 +207,7 @@ class _TableParser:
         """Make the parser of the columns that `pick` selects, by the header in the first `_HEAD_BYTES` of a text."""
         has_thousands = re.search(rb'"[-+]?\d{1,3}(?:,\d{3})+\.\d+"', head) is not None
         head = _join_thousands(head) if has_thousands else head
-        is_clock = 2 * len(re.findall(rb"(?m)^.*\d:\d\d:\d\d", head)) > head.count(b"\n")
+        is_clock = 2 * len(re.findall(rb"(?m)^.*(?:\d:\d\d:\d\d|\b\d\d:\d\d[.,]\d)", head)) > head.count(b"\n")
         text = _decode(_CLOCK.sub(_write_seconds, head) if is_clock else head, source)
         text = text if len(head) < _HEAD_BYTES else text.rpartition("\n")[0]
         header = read_header(text, source, sidecar_text, rate, is_clock=is_clock)
