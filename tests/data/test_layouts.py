@@ -256,6 +256,24 @@ def test_one_of_several_segments_is_chosen(layout: str, tmp_path: Path):
         assert fitact.inspect(path, segment=number, **how).time.size == COUNT
 
 
+SHARED = Path(__file__).parents[3] / "shared" / "records" / "layouts"
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="the shared files after other programs' layouts are not shipped")
+def test_segments_of_shared_files_hold_one_signal():
+    """All of them hold parts of a multisine, which wrdata.txt has with nine digits."""
+    _, V, _, Vsc = np.loadtxt(SHARED / "wrdata.txt").T
+    nodes = {"V": "V(drive)", "Vsc": "V(skin)"}
+    for name, segment, how, start, atol in (
+        ("ltspice.raw", None, nodes, 0, 1e-5), ("ltspice_steps.txt", 1, nodes, 0, 6e-5),
+        ("ltspice_steps.txt", 2, nodes, 0, 6e-5), ("lvm_segs.lvm", 1, {}, 0, 1e-6), ("lvm_segs.lvm", 2, {}, 800, 1e-6),
+    ):  # fmt: skip
+        record = fitact.read(SHARED / name, channels=how, segment=segment)
+        for channel, truth in (("V", V), ("Vsc", Vsc)):
+            shared = min(len(record), truth.size - start)
+            np.testing.assert_allclose(record[channel][:shared], truth[start : start + shared], atol=atol)
+
+
 def test_the_command_line_and_streams_choose_a_segment(tmp_path: Path, capsys):
     path, truth = tmp_path / "record.csv", noisy(2)
     path.write_text(SEGMENTED["LabVIEW"][0])

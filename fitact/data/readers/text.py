@@ -414,9 +414,10 @@ class _TableParser:
         """Return times of day in s since the first one, beyond midnights; refuse a clock that repeats its times."""
         if self._clock_start is None:
             self._clock_start = self._clock_end = float(time[0])
-        steps = np.diff(time, prepend=self._clock_end % _DAY)
-        steps = np.where(steps < -0.5 * _DAY, steps + _DAY, steps)
-        since = self._clock_end - self._clock_start + np.cumsum(steps)
+        with np.errstate(invalid="ignore"):  # a time that is not finite is refused later
+            steps = np.diff(time, prepend=self._clock_end % _DAY)
+            steps = np.where(steps < -0.5 * _DAY, steps + _DAY, steps)
+            since = self._clock_end - self._clock_start + np.cumsum(steps)
         self._clock_end = self._clock_start + float(since[-1])
         rate, second = self._header.rate, 1.0  # in which clocks are written at least
         if rate is not None and np.max(np.abs(since - np.arange(since.size) / rate)) <= second:
