@@ -34,35 +34,32 @@ def select_segment(segment: int | None, count: int, source: str) -> int:
 
 
 def choose_segment(capture: Capture, segment: int | None, stated: int = 1) -> Capture:
-    """Return one of the segments of a capture, from 1; see `split_segments`."""
-    parts = split_segments(capture, stated)
-    return parts[select_segment(segment, len(parts), capture.source)]
+    """Return one of the segments of a capture, from 1; see `split_time`."""
+    parts = split_time(capture.time, stated)
+    return take_part(capture, parts[select_segment(segment, len(parts), capture.source)])
 
 
-def split_segments(capture: Capture, stated: int = 1) -> list[Capture]:
-    """Return the segments of a capture: the runs in which the time starts anew, or `stated` equal parts."""
-
-    def take(part: slice) -> Capture:
-        return dataclasses.replace(
-            capture,
-            time=capture.time[part],
-            channels=tuple(dataclasses.replace(each, values=each.values[part]) for each in capture.channels),
-            row_label=lambda row: capture.row_label(row + part.start),
-        )
-
-    parts = _split_runs(capture.time, stated)
-    return [capture] if len(parts) == 1 else [take(part) for part in parts]
-
-
-def _split_runs(time: Float[np.ndarray, " samples"], stated: int) -> list[slice]:
+def split_time(time: Float[np.ndarray, " samples"], stated: int = 1) -> list[slice]:
+    """Return the segments of a file: the runs in which the time starts anew, or `stated` equal parts."""
     starts = np.flatnonzero(time[1:] < time[:-1]) + 1
     edges = np.concatenate([[0], starts, [time.size]])
     is_short = np.min(np.diff(edges)) < MINIMUM_SAMPLES
     # after a few rows out of order, others follow the rows before
     if not starts.size or is_short or not np.all(time[starts + MINIMUM_SAMPLES - 1] <= time[starts - 1]):
-        edges = np.arange(stated + 1) * (time.size // stated)
-        edges[-1] = time.size
+        count = stated if 1 < stated <= time.size // MINIMUM_SAMPLES else 1  # a damaged header may state any number
+        edges = np.append(np.arange(count) * (time.size // count), time.size)
     return [slice(int(start), int(stop)) for start, stop in itertools.pairwise(edges)]
+
+
+def take_part(capture: Capture, part: slice) -> Capture:
+    if part == slice(0, capture.time.size):
+        return capture
+    return dataclasses.replace(
+        capture,
+        time=capture.time[part],
+        channels=tuple(dataclasses.replace(each, values=each.values[part]) for each in capture.channels),
+        row_label=lambda row: capture.row_label(row + part.start),
+    )
 
 
 def find_parts(path: Path, stream: IO[bytes], segment: int | None, max_bytes: int) -> list[tuple[bytes, int]]:

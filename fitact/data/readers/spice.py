@@ -14,7 +14,7 @@ import numpy as np
 
 from fitact.data.readers.capture import Capture, FileChannel, Pick
 from fitact.data.readers.header import parse_number
-from fitact.data.readers.segments import select_segment, split_segments
+from fitact.data.readers.segments import select_segment, split_time, take_part
 from fitact.data.spectrum import ChannelName
 from fitact.errors import InputError
 from fitact.files import read_head
@@ -60,8 +60,9 @@ def read_spice(path: Path, source: str, pick: Pick, segment: int | None = None) 
     plots = [plot for plot in _read_plots(path) if plot.axis == "time"]
     if not plots:
         raise InputError(f"{source}: holds no transient analysis; run one (.tran), and keep its raw file")
-    runs = [run for plot in plots for run in split_segments(_make_capture(plot, source, pick))]
-    return runs[select_segment(segment, len(runs), source)]
+    runs = [(plot, part) for plot in plots for part in split_time(np.abs(plot.values[:, 0].real))]
+    plot, part = runs[select_segment(segment, len(runs), source)]
+    return take_part(_make_capture(plot, source, pick), part)
 
 
 def _make_capture(plot: Plot, source: str, pick: Pick) -> Capture:
