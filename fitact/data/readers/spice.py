@@ -159,7 +159,7 @@ def _read_plots(path: Path) -> list[Plot]:
         while content.strip(b"\r\n\0 ") and (not plots or is_spice(content)):
             plot, content = _read_plot(content)
             plots.append(plot)
-    except (ValueError, IndexError, KeyError) as error:
+    except (ValueError, IndexError, KeyError, TypeError) as error:
         reason = " ".join(str(error).split())[:120]
         raise InputError(f"{source}: cannot be read ({reason}); simulate again, or export text") from error
     return plots
