@@ -232,7 +232,7 @@ def _parse_rows(lines: Sequence[str], header: _Table, source: str, max_lines: in
 
 def _find_blocks(lines: Sequence[str]) -> Iterator[Rows]:
     """Yield blocks of three numbers in each line, without names above, whose first sweeps like a frequency."""
-    for delimiter in _DELIMITERS:
+    for delimiter in (each for each in _DELIMITERS if any(each in line for line in lines)):
         block: list[list[float]] = []
         above = 0  # cells of the line above the block
         for line in (*lines, ""):
