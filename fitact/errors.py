@@ -4,6 +4,7 @@ import shlex
 from collections.abc import Mapping
 
 RATE_OPTION = "--rate 100kHz (in Python: rate=100e3)"
+SEGMENT_OPTION = "--segment 1 (in Python: segment=1)"
 
 
 class InputError(ValueError):

@@ -115,27 +115,30 @@ def _swap_lines(rng: random.Random, content: bytearray, other: bytes) -> None:
     content[:] = b"\n".join(lines)
 
 
-def outcome(path: Path) -> str:
-    """Return "spectrum", "record", "capture" or "refused" for a file; any other exception is raised."""
+def outcome(path: Path, segment: int | None = None) -> str:
+    """Return "spectrum", "record", "capture" or "refused" for a file; any other exception is raised.
+
+    Where a file holds several segments, the first is read.
+    """
     try:
         if is_spectrum(path):
             for spectrum in fitact.read_spectra(path):
                 assert np.all(np.isfinite(spectrum.values) & np.isfinite(spectrum.frequency))
                 assert np.all(np.diff(spectrum.frequency) > 0.0)
             return "spectrum"
-        capture = read_capture(path)
+        capture = read_capture(path, segment=segment)
         assert len({trace.values.size for trace in capture.channels} | {capture.time.size}) == 1
-        fitact.inspect(path)
+        fitact.inspect(path, segment=segment)
     except fitact.InputError as error:
         _one_sentence(error, path)
-        assert len(preview(path)) < 100_000  # characters
-        return "refused"
+        assert len(preview(path, segment=segment)) < 100_000  # characters
+        return outcome(path, 1) if segment is None and "--segment 1" in str(error) else "refused"
     names = [trace.name for trace in capture.channels]
     try:
         asked = {} if any(n.lower() == "vsc" for n in names) else {"Vsc": names[-1]}
         resolve_channels(names, asked, str(path))
         scene = fitact.Scene(drive={"waveform": "square"})
-        record = fitact.read(path, scene, channels=asked)
+        record = fitact.read(path, scene, channels=asked, segment=segment)
     except fitact.InputError as error:
         _one_sentence(error, path)
         return "capture"

@@ -17,7 +17,7 @@ from fitact.errors import InputError
 from fitact.files import write_json
 
 CHANNELS = {"V": "drive voltage", "Vsc": "voltage across the skin", "I": "loop current", "Ft": "friction"}
-_OPTIONS = ("rate", "spectrum", "shunt", "band")
+_OPTIONS = ("rate", "segment", "shunt", "band")
 _processes: dict[Path, subprocess.Popen[bytes]] = {}  # that this server started, by the analysis's folder
 
 

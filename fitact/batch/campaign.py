@@ -140,6 +140,7 @@ def run_campaign(
     channels: Mapping[str, str] | None = None,
     scale: Mapping[str, float] | None = None,
     rate: float | None = None,
+    segment: int | None = None,
     scheduler: str | None = None,
     workers: int | None = None,
     memory: str = "2 GiB",
@@ -159,7 +160,7 @@ def run_campaign(
             as the records of one finger. The rows of a `Study` have its labels and covariates, too.
         folder: folder for the results.
         scene: scene of all records.
-        channels, scale, rate: channels and sampling rate of the files, as in `fitact.read`.
+        channels, scale, rate, segment: channels, sampling rate and segment of the files, as in `fitact.read`.
         scheduler: address of a Dask scheduler; None starts workers on this machine.
         workers: number of these workers, with one thread each; None means one for each core.
         memory: memory limit of each of these workers, above which it is restarted.
@@ -179,7 +180,9 @@ def run_campaign(
         if count > 1:
             raise InputError(f"{path}: is given twice; give each record once")
     out = Path(folder)
-    columns = {"channels": dict(channels or {}), "scale": dict(scale or {}), "rate": rate}
+    columns = {"channels": dict(channels or {}), "scale": dict(scale or {}), "rate": rate} | (
+        {} if segment is None else {"segment": segment}
+    )
     stated = None if scene is None else scene.to_json()
     task = Task(stated, columns, str(out / "reports") if reports else None, seed, posteriors)
     try:

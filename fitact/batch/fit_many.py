@@ -125,6 +125,7 @@ def fit_many(
     channels: Mapping[str, str] | None = None,
     scale: Mapping[str, float] | None = None,
     rate: float | None = None,
+    segment: int | None = None,
     whiteness: bool = True,
     progress: bool = True,
 ) -> Fits:
@@ -138,7 +139,7 @@ def fit_many(
         records: records, spectra, or paths of files; consumed one by one. A sequence of them is fitted jointly, as the
             records of one finger.
         scene: scene of all records.
-        channels, scale, rate: channels and sampling rate of the files, as in `fitact.read`.
+        channels, scale, rate, segment: channels, sampling rate and segment of the files, as in `fitact.read`.
         whiteness: whether to test the residuals of batches for structure. Without this test, a record is trusted if
             its residuals are no larger than its noise, and its `message` mentions the missing test.
         progress: whether to report the progress on standard error.
@@ -148,7 +149,8 @@ def fit_many(
     """
     make_rows = functools.partial(_fit_rows, scene=scene, whiteness=whiteness)
     title = "fitting the records" if progress else ""
-    return tabulate_records(records, scene, {"channels": channels, "scale": scale, "rate": rate}, make_rows, title)
+    columns = {"channels": channels, "scale": scale, "rate": rate, "segment": segment}
+    return tabulate_records(records, scene, columns, make_rows, title)
 
 
 def tabulate_records(

@@ -52,6 +52,7 @@ def sample_many(
     channels: Mapping[str, str] | None = None,
     scale: Mapping[str, float] | None = None,
     rate: float | None = None,
+    segment: int | None = None,
     seed: int = 0,
     progress: bool = True,
 ) -> Fits:
@@ -69,7 +70,7 @@ def sample_many(
     Args:
         records: records, spectra, paths of files, or sequences of them, as in `fit_many`.
         scene: scene of all records.
-        channels, scale, rate: channels and sampling rate of the files, as in `fitact.read`.
+        channels, scale, rate, segment: channels, sampling rate and segment of the files, as in `fitact.read`.
         seed: seed of the random numbers; the same seed gives the same rows.
         progress: whether to report the progress on standard error.
 
@@ -78,7 +79,8 @@ def sample_many(
     """
     make_rows = functools.partial(_sample_rows, scene=scene, seed=seed)
     title = "sampling the posteriors" if progress else ""
-    return tabulate_records(records, scene, {"channels": channels, "scale": scale, "rate": rate}, make_rows, title)
+    columns = {"channels": channels, "scale": scale, "rate": rate, "segment": segment}
+    return tabulate_records(records, scene, columns, make_rows, title)
 
 
 class _Targets(NamedTuple):

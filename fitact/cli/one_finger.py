@@ -26,7 +26,7 @@ def run(
     channel: options.Channels = None,
     scale: options.Scales = None,
     rate: options.Rate = None,
-    spectrum: options.SpectrumNumber = None,
+    segment: options.Segment = None,
     shunt: options.Shunt = None,
     band: options.Band = None,
     out: options.RecordOut = None,
@@ -45,8 +45,8 @@ def run(
     """
     announce("reading", records)
     folder = out or Path(f"{records[0].name.removesuffix('.gz').removesuffix('.csv')}-fitact")
-    choice = spectrum, shunt, band
-    planned = _fit_records(records, scene, (channel, scale, rate), choice, model, tolerance)
+    choice = segment, shunt, band
+    planned = _fit_records(records, scene, (channel, scale, rate, segment), choice, model, tolerance)
     if planned.omits_elements or verbose:
         print_stderr(planned.sentence)
     chain = folder / "chain.h5"
@@ -74,7 +74,7 @@ def fit(
     channel: options.Channels = None,
     scale: options.Scales = None,
     rate: options.Rate = None,
-    spectrum: options.SpectrumNumber = None,
+    segment: options.Segment = None,
     shunt: options.Shunt = None,
     band: options.Band = None,
     out: options.Out = None,
@@ -100,8 +100,8 @@ def fit(
     With --out, writes fit.json into DIR. Several records or spectra are fitted jointly.
     """
     announce("reading", records)
-    choice = spectrum, shunt, band
-    planned = _fit_records(records, scene, (channel, scale, rate), choice, model, tolerance, starts)
+    choice = segment, shunt, band
+    planned = _fit_records(records, scene, (channel, scale, rate, segment), choice, model, tolerance, starts)
     fitted = planned.fit
     text, content = fitted.summary(verbose=verbose), fitted.to_dict() | {"plan": planned.to_dict()}
     text += f"\n{planned.sentence}" if planned.omits_elements or verbose else ""

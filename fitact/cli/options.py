@@ -61,9 +61,14 @@ Rate = Annotated[
     str | None,
     typer.Option("--rate", metavar="RATE", help="Sampling rate, e.g. 48kHz, for times that were rounded when written."),
 ]
-SpectrumNumber = Annotated[
+Segment = Annotated[
     str | None,
-    typer.Option("--spectrum", metavar="N", help="Number of a spectrum in a file that holds several, from 1, or all."),
+    typer.Option(
+        "--segment",
+        "--spectrum",
+        metavar="N",
+        help="Number, from 1, of a run, step, frame or sheet in a file that holds several; of spectra also all.",
+    ),
 ]
 Shunt = Annotated[
     str | None,
@@ -131,8 +136,8 @@ Model = Annotated[
         " plan`); full: keep every element of the scene.",
     ),
 ]
-Columns = tuple[list[str] | None, list[str] | None, str | None]  # --channel, --scale and --rate as given
-SpectrumChoice = tuple[str | None, str | None, str | None]  # --spectrum, --shunt and --band as given
+Columns = tuple[list[str] | None, list[str] | None, str | None, str | None]  # --channel, --scale, --rate, --segment
+SpectrumChoice = tuple[str | None, str | None, str | None]  # --segment, --shunt and --band as given
 Results = Annotated[Path, typer.Argument(metavar="DIR", help="Folder with the results.")]
 Fresh = Annotated[bool, typer.Option("--fresh", help="Start a new chain instead of resuming the one in DIR.")]
 
@@ -159,13 +164,20 @@ def load_scene(path: Path | str | None) -> "fitact.Scene | None":
 
 
 def column_options(columns: Columns) -> dict[str, Any]:
-    """Return the values of --channel, --scale and --rate as keyword arguments of `fitact.read`."""
-    channels, scale, rate = columns
+    """Return the values of --channel, --scale, --rate and --segment as keyword arguments of `fitact.read`."""
+    channels, scale, rate, segment = columns
     return {
         "channels": parse_pairs("--channel Vsc=CH2", channels),
         "scale": parse_numbers("--scale Vsc=10", scale),
         "rate": None if rate is None else parse_option("--rate", rate, "Hz"),
+        "segment": None if segment == "all" else _parse_segment(segment),
     }
+
+
+def _parse_segment(text: str | None) -> int | None:
+    if text is not None and not (text.isdecimal() and int(text)):
+        raise InputError(f"--segment {text}: write a number from 1, or all (of spectra)")
+    return None if text is None else int(text)
 
 
 def parse_option(name: str, text: str, unit: str) -> float:
@@ -177,15 +189,13 @@ def parse_option(name: str, text: str, unit: str) -> float:
 
 
 def read_spectra(path: Path, choice: SpectrumChoice) -> list["fitact.Spectrum"]:
-    """Read the spectra of a file that --spectrum chooses, with --shunt and --band; all of them for "all"."""
+    """Read the spectra of a file that --segment chooses, with --shunt and --band; all of them for "all"."""
     number, resistor, band = choice
     shunt = None if resistor is None else parse_option("--shunt", resistor, "ohm")
     if number == "all":
         spectra = list(fitact.read_spectra(path, shunt))
-    elif number is None or number.isdecimal():
-        spectra = [fitact.read_spectrum(path, None if number is None else int(number), shunt)]
     else:
-        raise InputError(f"--spectrum {number}: write a number from 1, or all")
+        spectra = [fitact.read_spectrum(path, _parse_segment(number), shunt)]
     if band is None:
         return spectra
     ends = [parse_option("--band", end, "Hz") for end in band.split("..")]

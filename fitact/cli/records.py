@@ -22,7 +22,7 @@ def inspect(
     channel: options.Channels = None,
     scale: options.Scales = None,
     rate: options.Rate = None,
-    spectrum: options.SpectrumNumber = "all",
+    segment: options.Segment = None,
     shunt: options.Shunt = None,
     band: options.Band = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Plot to write (.svg or .png).")] = None,
@@ -34,11 +34,11 @@ def inspect(
     is refused, show the columns, the first rows and a guess at the command that reads it.
     """
     try:
-        _inspect(file, (channel, scale, rate), (spectrum, shunt, band), out, json)
+        _inspect(file, (channel, scale, rate, segment), (segment or "all", shunt, band), out, json)
     except InputError:
         if not json:
-            rate_given = options.column_options((channel, scale, rate))["rate"]
-            if shown := internal.preview(file, rate_given):
+            stated = options.column_options((None, None, rate, segment))
+            if shown := internal.preview(file, stated["rate"], stated["segment"]):
                 print(shown, flush=True)
         raise
 
@@ -79,6 +79,7 @@ def compare(
     channel: options.Channels = None,
     scale: options.Scales = None,
     rate: options.Rate = None,
+    segment: options.Segment = None,
     json: options.Json = False,
 ) -> None:
     """Fit the full model of each scene to the same records, and report which model predicts the data best."""
@@ -87,7 +88,7 @@ def compare(
     models = {str(path) if same_stems else path.stem: fitact.Scene.load(path) for path in scenes}
     for model in models.values():
         model.require_available(fit=True)
-    first, columns = next(iter(models.values())), options.column_options((channel, scale, rate))
+    first, columns = next(iter(models.values())), options.column_options((channel, scale, rate, segment))
     comparison = fitact.compare([internal.read_any(path, first, **columns) for path in records], models)
     show(str(comparison), comparison.to_dict(), json, comparison.trusted)
 
@@ -107,6 +108,7 @@ def population(
     channel: options.Channels = None,
     scale: options.Scales = None,
     rate: options.Rate = None,
+    segment: options.Segment = None,
     covariates: Annotated[
         Path | None,
         typer.Option("--covariates", metavar="FILE", help="CSV with a column 'record' and a column per covariate."),
@@ -139,7 +141,7 @@ def population(
     if fresh and out is not None:
         internal.delete_chains(out)
     fitted = fitact.population(
-        internal.RecordFiles(paths, loaded, **options.column_options((channel, scale, rate))), loaded,
+        internal.RecordFiles(paths, loaded, **options.column_options((channel, scale, rate, segment))), loaded,
         labels=None if study is None else study.labels, covariates=covariate_values,
         at=options.parse_numbers("--at moisture=0.4", at), folder=out, seed=seed,
     )  # fmt: skip
@@ -165,6 +167,7 @@ def track(
     channel: options.Channels = None,
     scale: options.Scales = None,
     rate: options.Rate = None,
+    segment: options.Segment = None,
     out: options.Out = None,
     window: Annotated[
         str | None,
@@ -190,7 +193,7 @@ def track(
     found = fitact.track(
         record, loaded, window=None if window is None else options.parse_option("--window", window, "s"),
         follow=patience, folder=out, update=(lambda track: print(track.describe_last(), flush=True)) if live else None,
-        **options.column_options((channel, scale, rate)),
+        **options.column_options((channel, scale, rate, segment)),
     )  # fmt: skip
     content = found.to_dict() | {"command": command_line()}
     if out is not None:
@@ -215,6 +218,7 @@ def campaign(
     channel: options.Channels = None,
     scale: options.Scales = None,
     rate: options.Rate = None,
+    segment: options.Segment = None,
     scheduler: Annotated[
         str | None,
         typer.Option("--scheduler", metavar="ADDRESS", help="Address of a Dask scheduler, e.g. tcp://host:8786."),
@@ -242,7 +246,7 @@ def campaign(
     announce("fitting", records or () if study is None else study.records)
     loaded = options.load_scene(scene)
     fits = fitact.run_campaign(
-        study or records or (), out, loaded, **options.column_options((channel, scale, rate)),
+        study or records or (), out, loaded, **options.column_options((channel, scale, rate, segment)),
         scheduler=scheduler, workers=workers, memory=memory, posteriors=posteriors,
         reports=reports, seed=seed,
     )  # fmt: skip
@@ -261,6 +265,7 @@ def tradeoff(
     channel: options.Channels = None,
     scale: options.Scales = None,
     rate: options.Rate = None,
+    segment: options.Segment = None,
     out: options.Out = None,
     json: options.Json = False,
 ) -> None:
@@ -270,7 +275,11 @@ def tradeoff(
     """
     announce("measuring", [record or scene or "the nominal scene"])
     loaded = options.load_scene(scene)
-    measured = None if record is None else fitact.read(record, loaded, **options.column_options((channel, scale, rate)))
+    measured = (
+        None
+        if record is None
+        else fitact.read(record, loaded, **options.column_options((channel, scale, rate, segment)))
+    )
     costs = fitact.measure_tradeoff(measured, loaded)
     if out is not None:
         report.write_folder(out, costs, command_line(), loaded, [measured] if measured else [])

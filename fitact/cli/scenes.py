@@ -19,6 +19,7 @@ from fitact.cli.options import (
     Scales,
     SceneFile,
     Seed,
+    Segment,
     Table,
     column_options,
     load_study,
@@ -70,6 +71,7 @@ def plan(
     channel: Channels = None,
     scale: Scales = None,
     rate: Rate = None,
+    segment: Segment = None,
     out: Out = None,
     json: Json = False,
 ) -> None:
@@ -80,7 +82,9 @@ def plan(
     """
     announce("planning for", [scene])
     loaded = fitact.Scene.load(scene)
-    measured = None if record is None else fitact.read(record, loaded, **column_options((channel, scale, rate)))
+    measured = (
+        None if record is None else fitact.read(record, loaded, **column_options((channel, scale, rate, segment)))
+    )
     planned = fitact.plan(loaded) if measured is None else internal.plan_for_record(measured, loaded)
     if out is not None:
         report.write_folder(out, planned, command_line(), loaded, [measured] if measured else [])
@@ -139,6 +143,7 @@ def measurement(
     channel: Channels = None,
     scale: Scales = None,
     rate: Rate = None,
+    segment: Segment = None,
     out: Out = None,
     json: Json = False,
 ) -> None:
@@ -148,7 +153,7 @@ def measurement(
     """
     announce("ranking measurements for", [scene])
     stated = fitact.Scene.load(scene)
-    columns = column_options((channel, scale, rate))
+    columns = column_options((channel, scale, rate, segment))
     measured = [fitact.read(path, stated, **columns) for path in record or ()]  # refused before the slow imports
     options = fitact.design_measurement(stated, measured)
     if out is not None:
@@ -181,6 +186,7 @@ def drive(
     channel: Channels = None,
     scale: Scales = None,
     rate: Rate = None,
+    segment: Segment = None,
     out: Out = None,
     seed: Seed = 0,
     json: Json = False,
@@ -199,7 +205,7 @@ def drive(
     if study is None and len(paths) == 1 and (paths[0] / "population.json").exists():
         people = paths[0]
     elif paths:
-        measured = internal.RecordFiles(paths, stated, **column_options((channel, scale, rate)))
+        measured = internal.RecordFiles(paths, stated, **column_options((channel, scale, rate, segment)))
         labels, covariates = (None, None) if study is None else (study.labels, study.covariates)
         people = fitact.population(measured, stated, labels=labels, covariates=covariates, folder=out, seed=seed)
         fingers = people.fingers

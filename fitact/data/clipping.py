@@ -30,6 +30,8 @@ def replace_codes(values: Float[np.ndarray, " samples"], code: float = 9e36, min
     As many of them, some in a row, count as clipped then (`clipping_mask`); few remain, and a record refuses them.
     Codes are infinite, or at least `code` in size.
     """
+    if values.min(initial=0.0) > -code and values.max(initial=0.0) < code:
+        return
     for sign in (1.0, -1.0):
         beyond = sign * values >= code
         within = np.abs(values) < code

@@ -112,21 +112,23 @@ def inspect(
     channels: Mapping[str, str] | None = None,
     scale: Mapping[str, float] | None = None,
     rate: float | None = None,
+    segment: int | None = None,
 ) -> Inspection:
     """Inspect a file without fitting it; channels are V, Vsc and I if known or named, otherwise those of the file.
 
-    `channels`, `scale` and `rate` as in `fitact.read`.
+    `channels`, `scale`, `rate` and `segment` as in `fitact.read`.
 
     Raises:
         InputError: the file cannot be read, or its V, Vsc or I could not be fitted.
     """
-    capture = replace_rounded_times(merge_other_files(read_capture(path, rate=rate), path, channels or {}, rate), rate)
+    capture = read_capture(path, rate=rate, segment=segment)
+    capture = replace_rounded_times(merge_other_files(capture, path, channels or {}, rate, segment), rate)
     if channels or scale or has_standard_names(capture):
         record = to_record(capture, channels or {}, scale or {})
         arrays = {name: (record[name], CHANNEL_UNITS[name]) for name in record.channels}
         notes = record.notes
         if not channels and not {"Vsc", "I"} & set(record.channels):
-            notes = (*notes, _assignment_note(capture, rate))
+            notes = (*notes, _assignment_note(capture, rate, segment))
         return _inspect_channels(capture, record.time, arrays, notes)
     time = capture.time
     if time.size < 2 or not np.all(np.isfinite(time)) or np.any(np.diff(time) <= 0.0):
@@ -135,12 +137,12 @@ def inspect(
             f" {STATE_RATE}; otherwise sort the rows, drop repeated ones, and check which column is time"
         )
     arrays = {trace.name: (trace.values, trace.unit) for trace in capture.channels}
-    notes = (*capture.notes, *grid_notes(time, capture.source), _assignment_note(capture, rate))
+    notes = (*capture.notes, *grid_notes(time, capture.source), _assignment_note(capture, rate, segment))
     return _inspect_channels(capture, time, arrays, notes)
 
 
-def _assignment_note(capture: Capture, rate: float | None) -> str:
-    reason, command = guess_command(capture, rate)
+def _assignment_note(capture: Capture, rate: float | None, segment: int | None) -> str:
+    reason, command = guess_command(capture, rate, segment=segment)
     return f"{capture.source}: the channels are not assigned; guess {reason}" + f": {command}" * bool(command)
 
 

@@ -2,6 +2,7 @@
 
 import collections
 import contextlib
+import itertools
 import os
 import re
 import shlex
@@ -20,14 +21,16 @@ from fitact.files import read_head
 from fitact.tables import align_table
 
 
-def preview(path: str | os.PathLike[str], rate: float | None = None) -> str:
-    """Return columns, first rows and a guess for a file that is refused; `rate` (Hz) was stated by the user.
+def preview(path: str | os.PathLike[str], rate: float | None = None, segment: int | None = None) -> str:
+    """Return columns, first rows and a guess for a file that is refused; `rate` (Hz) and `segment` are the user's.
 
-    A text without enough rows of numbers is shown as it is. Of other files that cannot be read nothing is shown.
+    Of several segments, the first is shown. A text without enough rows of numbers is shown as it is. Of other files
+    that cannot be read nothing is shown.
     """
-    for given in (None, rate or 1.0):  # any rate shows the columns of a file without times
+    # any rate shows the columns of a file without times
+    for given, chosen in itertools.product((None, rate or 1.0), dict.fromkeys((segment, segment or 1))):
         with contextlib.suppress(InputError):
-            capture = read_capture(path, rate=given)
+            capture = read_capture(path, rate=given, segment=chosen)
             if capture.time.size < MINIMUM_SAMPLES:
                 break
             is_timed = given is None
@@ -36,7 +39,7 @@ def preview(path: str | os.PathLike[str], rate: float | None = None) -> str:
                 f"{capture.source} ({capture.format}) holds {capture.time.size:,} rows in {count} columns of values:"
             )
             table = describe_rows(capture.channels, capture.time if is_timed else None)
-            reason, command = guess_command(capture, None if is_timed else rate, is_timed)
+            reason, command = guess_command(capture, None if is_timed else rate, is_timed, chosen)
             return "\n".join([title, *table, f"guess {reason}" + f":\n  {command}" * bool(command)])
     with contextlib.suppress(InputError):
         head = read_head(path)
@@ -61,10 +64,12 @@ def describe_rows(
     return [f"  {line}" for line in align_table([[name for name, _ in shown], *rows])]
 
 
-def guess_command(capture: Capture, rate: float | None = None, is_timed: bool = True) -> tuple[str, str]:
+def guess_command(
+    capture: Capture, rate: float | None = None, is_timed: bool = True, segment: int | None = None
+) -> tuple[str, str]:
     """Return a guess at the channels of a file, by their units and sizes, and the command that reads it so, or "".
 
-    `rate` (Hz) is what the user stated. A file that is not timed needs a rate.
+    `rate` (Hz) is what the user stated. A file that is not timed needs a rate. `segment` is the one that was read.
     """
     columns = capture.channels
     if capture.time.size < MINIMUM_SAMPLES:
@@ -89,6 +94,8 @@ def guess_command(capture: Capture, rate: float | None = None, is_timed: bool = 
         name, guessed = _find_clock(capture, is_timed)
         remarks.append(f"with {name} in s" if name else "with your sampling rate in place of this one")
         options += ["--rate", guessed]
+    if segment is not None:
+        options += ["--segment", str(segment)]
     for channel, column in assigned.items():
         options += ["--channel", f"{channel}={column.name}"]
     for channel, is_full_scale in scaled.items():

@@ -10,7 +10,7 @@ from fitact.tracking.tracked_finger import TrackedFinger
 
 
 class RecordFiles(Sequence[Any]):
-    """Records and spectra of a scene, each read on access with the `columns` (channels, scale, rate) of `fitact.read`.
+    """Records and spectra of a scene, each read on access with the `columns` (channels, scale, ...) of `fitact.read`.
 
     A folder stands for the track that `fitact track` left there, and so do its files.
     """

@@ -64,6 +64,7 @@ def track(
     channels: Mapping[str, str] | None = None,
     scale: Mapping[str, float] | None = None,
     rate: float | None = None,
+    segment: int | None = None,
     follow: float = 0.0,
     folder: str | os.PathLike[str] | None = None,
     update: Callable[[Track], None] | None = None,
@@ -81,7 +82,7 @@ def track(
         record: a record, the path of one, or "-" for standard input; V and the channels of the scene are needed.
         scene: device, circuit and prior. A waveform that it states is not used.
         window: length of a window, s; default: five periods of the drive, at least 4,000 samples.
-        channels, scale, rate: as in `fitact.read`, for a path.
+        channels, scale, rate, segment: as in `fitact.read`, for a path.
         follow: seconds to wait for more samples at the end of a text file that is still being written.
         folder: folder in which an interrupted run leaves what it has compressed, and from which it goes on.
         update: called with the track so far, about once a second, while the record is followed.
@@ -99,7 +100,7 @@ def track(
         blocks: Iterator[Block] = iter([Block(record.time, record.channels, float(len(record)))])
         source, total = record.source, float(len(record))
     else:
-        blocks = stream_record(record, channels=channels, scale=scale, rate=rate, follow=follow)
+        blocks = stream_record(record, channels=channels, scale=scale, rate=rate, segment=segment, follow=follow)
         source = os.fspath(record)
         total = float(os.path.getsize(source)) if os.path.isfile(source) and follow <= 0.0 else math.inf
     return track_blocks(blocks, source, total, scene, window=window, folder=folder, update=update, rates=rates)

@@ -112,7 +112,7 @@ KINDS: dict[str, tuple] = {
     "binary of no known kind": ("refused", bare(bytes(range(256)) * 50), "neither a text file"),
     "broken gzip": ("refused", bare(b"\x1f\x8b broken"), "cannot be read"),
     "cut gzip": ("refused", lambda t: gzip.compress(text_of(t).encode())[:-500], "cannot be read"),
-    "spreadsheet": ("refused", bare(b"PK\x03\x04" + b"\0" * 100), "cannot be read"),
+    "damaged spreadsheet": ("refused", bare(b"PK\x03\x04" + b"\0" * 100), "cannot be read"),
     "cut file": ("refused", above("#Samples: 9999\n"), "states 9,999 rows, but the file has 4,000"),
     "several segments": ("refused", above("LECROYx,1,Waveform\nSegments,3,SegmentSize,400\n"), "holds 3 segments"),
     # the header
@@ -158,7 +158,8 @@ KINDS: dict[str, tuple] = {
     "UTF-16": ("read", lambda t: text_of(t).encode("utf-16"), ""),
     # the times
     "repeated time": ("refused", rows(lambda n: np.sort(np.r_[:n, 100])), "line 103: the time 0.005 s repeats"),
-    "time that goes back": ("refused", rows(lambda n: np.r_[: n // 2, : n // 2]), "goes back"),
+    "time that starts anew": ("refused", rows(lambda n: np.r_[: n // 2, : n // 2]), "holds 2 segments"),
+    "time that goes back": ("refused", rows(lambda n: np.r_[: n // 2, :9, n // 2 : n]), "goes back"),
     "unsorted rows": ("refused", rows(lambda n: np.r_[1, 0, 2:n]), "line 3: the time 0 s goes back"),
     "time that is not finite": ("refused", put("time_s", at(100, np.nan)), "line 102: time is nan"),
     "time rounded until it repeats": ("refused", put("time_s", lambda x: np.round(x, 4)), "state the sampling rate"),

@@ -170,10 +170,24 @@ def test_large_blocks_are_read_like_small_ones(tmp_path: Path):
     path = tmp_path / "large.csv"
     np.savetxt(path, table, delimiter=",", header="time_s,V_V,Vsc_V", comments="", fmt="%.17g")
     assert path.stat().st_size > 1_048_576
-    record = fitact.read(path)
-    np.testing.assert_array_equal(np.column_stack([record.time, record["V"], record["Vsc"]]), table)
     lines = path.read_text().splitlines()
-    lines[30_000] = lines[30_000].rsplit(",", 1)[0] + ",oops"
-    path.write_text("\n".join(lines) + "\n")
-    with pytest.raises(fitact.InputError, match="line 30001, column 3: 'oops' is not a number"):
-        fitact.read(path)
+    head, tail = lines[:30_000], lines[30_000:]
+    for written in (
+        lines, ["# five\" of a comment", *lines], [line + "," for line in lines], [line + "\r" for line in lines],
+        [*head, "", *tail, ""], [*head, "# a remark", *tail],
+        [line.replace(",", ";").replace(".", ",") for line in lines],
+    ):  # fmt: skip
+        path.write_text("\n".join(written), newline="\n")
+        record = fitact.read(path)
+        np.testing.assert_array_equal(np.column_stack([record.time, record["V"], record["Vsc"]]), table)
+    for changed, words in (
+        (tail[0].rsplit(",", 1)[0] + ",oops", "line 30001, column 3: 'oops' is not a number"),
+        (tail[0].rsplit(",", 1)[0], "line 30001: 2 values, but other rows have 3"),
+        (tail[0] + ",1", "line 30001: 4 values, but other rows have 3"),
+        (tail[0].rsplit(",", 1)[0] + ",", "line 30001, column 3: the cell is empty"),
+        (tail[0].rsplit(",", 1)[0] + ",nan", "line 30001: Vsc is nan"),
+        (head[1], "line 30001: the time 0 s goes back"),
+    ):
+        path.write_text("\n".join([*head, changed, *tail[1:]]))
+        with pytest.raises(fitact.InputError, match=words):
+            fitact.read(path)

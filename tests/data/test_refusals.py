@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import gzip
 import re
+import struct
 import sys
 import types
 import zipfile
@@ -19,22 +20,37 @@ import scipy.io
 
 import fitact
 from fitact.data import inspection, record, spectrum
-from fitact.data.readers import binary, capture, header, layouts, matlab, read, stream, text
+from fitact.data.readers import (
+    binary,
+    capture,
+    extras,
+    header,
+    layouts,
+    matlab,
+    read,
+    segments,
+    spice,
+    spreadsheet,
+    stream,
+    text,
+)
 from fitact.data.readers import spectrum as spectrum_files
 from tests.data.test_bad_input import KINDS, make_file
 from tests.data.test_layouts import REFUSED as REFUSED_LAYOUTS
 from tests.data.test_scope_files import SKIN
 from tests.data.test_spectrum import BROKEN
 from tests.data.test_spectrum import broken as write_broken
+from tests.layouts.files import raw, write_xlsx
 from tests.layouts.layout import SCOPE, TIME, VSC, V, rows
-from tests.layouts.records import ARRAYS, PLAIN, write_mat, write_tdms, write_wav
-from tests.layouts.spectra import FILES, FREQUENCY, Z
+from tests.layouts.records import ARRAYS, PLAIN, spice_file, write_mat, write_tdms, write_wav
+from tests.layouts.spectra import FILES, FREQUENCY, GAIN, Z
 from tests.layouts.spectra import write as write_spectrum
 
 READERS = (
-    binary, capture, header, layouts, matlab, read, stream, text, spectrum_files, record, spectrum, inspection,
+    binary, capture, extras, header, layouts, matlab, read, segments, spice, spreadsheet, stream, text, spectrum_files,
+    record, spectrum, inspection,
 )  # fmt: skip
-OPTIONS = {"--rate": "rate=", "--channel": "channels=", "--scale": "scale=", "--spectrum": "number="}
+OPTIONS = {"--rate": "rate=", "--channel": "channels=", "--scale": "scale=", "--segment": "segment="}
 REMEDIES = re.compile(
     r"--[a-z]|\b(add|average|begin|check|choose|correct|drop|export|give|interpolate|keep|measure|name|pip|put|record"
     r"|remove|rename|save|scale|shorten|sort|state|store|write)\b"
@@ -111,6 +127,27 @@ def write_zip(folder: Path) -> Path:
     return folder / "a.zip"
 
 
+def write_damaged_sheet(folder: Path) -> Path:
+    with zipfile.ZipFile(folder / "a.xlsx", "w") as file:
+        file.writestr("xl/workbook.xml", "0,1,2\n")
+    return folder / "a.xlsx"
+
+
+def write_short_segment(folder: Path) -> Path:
+    """Write a segment of Keysight's memory whose headers, of 140 and 12 bytes, state more samples than there are."""
+    real, count = (SCOPE / "agilent_1.bin").read_bytes(), 1000
+    body = real[12:148] + struct.pack("<I", 1) + real[152:160] + struct.pack("<i", 4 * count) + real[164:][: 4 * count]
+    (folder / "a.bin").write_bytes(real[:4] + struct.pack("<2I", 12 + len(body), 1) + body)
+    return folder / "a.bin"
+
+
+def analysis(name: str, axis: str) -> Callable[[Path], Path]:
+    """Return the writer of a raw file with another analysis of two voltages."""
+    waves = {node: ("voltage", size * GAIN) for node, size in (("V(a)", 1.0), ("V(b)", 2.0))}
+    content = raw([(FREQUENCY, waves)], "double", "complex", name=name)
+    return put(content.replace(b"\tfrequency\tfrequency", f"\t{axis}\t{axis}".encode()), "a.raw")
+
+
 def write_huge_hdf5(folder: Path) -> Path:
     import h5py
 
@@ -137,6 +174,11 @@ def write_two_files(folder: Path) -> Path:
 
 def sweep(scale: complex = 1.0) -> Callable[[Path], Path]:
     return lambda folder: write_spectrum(folder / "z.csv", *FILES["plain.csv"], scale * Z)
+
+
+def write_two_sweeps(folder: Path) -> Path:
+    first, second = (sweep(scale)(folder).read_text().splitlines() for scale in (1.0, 0.5))
+    return put("\n".join([*first, *second[1:]]), "z.csv")(folder)
 
 
 def from_arrays(path: Path, **channels: np.ndarray) -> fitact.Record:
@@ -237,6 +279,15 @@ REFUSALS: dict[str, Refusal] = {
     "cut MATLAB": Refusal(cut(write_mat, 0.7), "cannot be read"),
     "another zip": Refusal(write_zip, "is a zip archive"),
     "complex numbers": Refusal(write_iq, "complex"),
+    "short segment": Refusal(write_short_segment, "has 1,000 of 2,000 samples", {"channels": {"Vsc": "CH 1"}}),
+    "second of one segment": Refusal(put(PLAIN), "holds one segment", {"segment": 2}),
+    "operating points": Refusal(analysis("Operating Point", "x"), "no transient analysis"),
+    "two voltages": Refusal(
+        analysis("AC Analysis", "frequency"), r"which of the voltages V\(a\), V\(b\)", call=fitact.read_spectrum
+    ),
+    "cut raw file": Refusal(cut(spice_file("mixed"), 0.7), "so it is truncated"),
+    "empty sheet": Refusal(lambda folder: write_xlsx(folder / "a.xlsx", [["V"], ["Vsc"]]), "no sheet has rows"),
+    "damaged sheet": Refusal(write_damaged_sheet, "cannot be read .*; save the sheet again"),
     "counts": Refusal(npz(XInc=1e-6, YInc=0.01, Vsc=np.arange(50)), "ADC counts"),
     "arrays without time": Refusal(npz(Vsc=TIME), "has no time"),
     "arrays without channels": Refusal(npz(time=TIME), "no one-dimensional array except the time"),
@@ -248,10 +299,10 @@ REFUSALS: dict[str, Refusal] = {
     "spectrum in place of a record": Refusal(sweep(), "is a spectrum, without time"),
     "record in place of a spectrum": Refusal(put(PLAIN), "no line names a frequency", call=fitact.read_spectrum),
     "two spectra": Refusal(
-        lambda folder: write_two_sweeps(folder), "holds 2 spectra; choose one", call=fitact.read_spectrum
+        write_two_sweeps, r"holds 2 spectra; choose one, as --segment 1", call=fitact.read_spectrum
     ),
     "third of two spectra": Refusal(
-        lambda folder: write_two_sweeps(folder), "there is no number 3", {"number": 3}, fitact.read_spectrum
+        write_two_sweeps, "there is no number 3", {"segment": 3}, fitact.read_spectrum
     ),
     "narrow band": Refusal(sweep(), "2 of 41 points", call=select_band),
     "shapes of a spectrum": Refusal(
@@ -261,11 +312,6 @@ REFUSALS: dict[str, Refusal] = {
         sweep(), "holds the frequency 0 Hz", {"frequency": np.arange(9.0), "values": np.ones(9)}, spectrum_from_arrays
     ),
 }  # fmt: skip
-
-
-def write_two_sweeps(folder: Path) -> Path:
-    first, second = (sweep(scale)(folder).read_text().splitlines() for scale in (1.0, 0.5))
-    return put("\n".join([*first, *second[1:]]), "z.csv")(folder)
 
 
 @dataclasses.dataclass(frozen=True)

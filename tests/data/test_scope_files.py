@@ -1,6 +1,7 @@
 """Oscilloscope files: real captures, and small files in the layouts that manufacturers document."""
 
 import gzip
+import importlib
 import struct
 from pathlib import Path
 
@@ -136,15 +137,67 @@ def test_tektronix_binary_against_its_counts():
 
 @pytest.mark.usefixtures("rigolwfm")
 def test_lecroy_binary_against_its_descriptor():
-    """LeCroy's template: lengths of the blocks at 36, gain at 156, offset at 160, interval at 176, start at 180."""
+    """LeCroy's template: lengths of the blocks at 36, gain at 156, offset at 160, interval at 176, start at 180.
+
+    It counts 20 segments of a sequence at 144, milliseconds apart by the list of their triggers.
+    """
     content = (SCOPE / "lecroy_3.trc").read_bytes()
     at = content.index(b"WAVEDESC")
     gain, offset = struct.unpack("<2f", content[at + 156 : at + 164])
     step, start = struct.unpack("<fd", content[at + 176 : at + 188])
     counts = np.frombuffer(content, "<i2", 10040, at + sum(struct.unpack("<6i", content[at + 36 : at + 60])))
-    capture = read_capture(SCOPE / "lecroy_3.trc")
-    np.testing.assert_allclose(capture.channels[0].values, gain * counts - offset, atol=1e-9)
-    np.testing.assert_allclose(capture.time, start + step * np.arange(10040), atol=1e-15)
+    with pytest.raises(fitact.InputError, match=r"holds 20 segments .* choose one, as --segment 1"):
+        fitact.inspect(SCOPE / "lecroy_3.trc")
+    for number in (1, 2, 20):
+        capture = read_capture(SCOPE / "lecroy_3.trc", segment=number)
+        truth = gain * counts[502 * (number - 1) : 502 * number] - offset
+        np.testing.assert_allclose(capture.channels[0].values, truth, atol=1e-9)
+        np.testing.assert_allclose(capture.time, start + step * np.arange(502), atol=1e-15)
+    with pytest.raises(fitact.InputError, match=r"there is no number 21"):
+        read_capture(SCOPE / "lecroy_3.trc", segment=21)
+
+
+@pytest.mark.usefixtures("rigolwfm")
+def test_segmented_memory_of_keysight(tmp_path: Path):
+    """Manual: each segment of a channel has headers of 140 + 12 bytes, with the number of the segment at 136."""
+    content, path = (SCOPE / "agilent_1.bin").read_bytes(), tmp_path / "segments.bin"
+    samples = floats(SCOPE / "agilent_1.bin", 164, 2000)
+    waves = [np.roll(samples, 7 * i).astype("<f4") for i in range(6)]
+    parts = [
+        content[12:124] + str(i % 2 + 1).encode() + content[125:148] + struct.pack("<I", i // 2 + 1) + content[152:164]
+        + wave.tobytes()
+        for i, wave in enumerate(waves)
+    ]  # fmt: skip
+    body = b"".join(parts)
+    path.write_bytes(content[:4] + struct.pack("<II", 12 + len(body), 6) + body)
+    with pytest.raises(fitact.InputError, match=r"holds 3 segments .* choose one, as --segment 1"):
+        read_capture(path)
+    for number in (1, 2, 3):
+        capture = read_capture(path, segment=number)
+        assert [(each.name, each.unit) for each in capture.channels] == [("CH 1", "V"), ("CH 2", "V")]
+        for i, channel in enumerate(capture.channels):
+            np.testing.assert_array_equal(channel.values, waves[2 * number - 2 + i])
+        np.testing.assert_allclose(capture.time, read_capture(SCOPE / "agilent_1.bin").time, atol=1e-12)
+
+
+@pytest.mark.usefixtures("rigolwfm")
+def test_frames_of_tektronix_binary(monkeypatch):
+    """RigolWFM reads one frame of a FastFrame capture at a time, and counts them."""
+    wfm = importlib.import_module("RigolWFM.wfm")
+    asked: list[int] = []
+    plain = wfm.Wfm.from_file
+
+    def from_file(path: str, frame: int = 0):
+        asked.append(frame)
+        found = plain(path)
+        found.frame_count = 3
+        return found
+
+    monkeypatch.setattr(wfm.Wfm, "from_file", from_file)
+    with pytest.raises(fitact.InputError, match=r"holds 3 segments .* choose one, as --segment 1"):
+        read_capture(SCOPE / "tek_golden_analog.wfm")
+    assert read_capture(SCOPE / "tek_golden_analog.wfm", segment=2).time.size
+    assert asked == [0, 0, 1]
 
 
 @pytest.mark.usefixtures("rigolwfm")

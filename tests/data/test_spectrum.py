@@ -45,7 +45,7 @@ def test_sweeps_of_one_file_are_told_apart(tmp_path: Path):
     with pytest.raises(fitact.InputError, match="there is no number 3"):
         fitact.read_spectrum(path, 3)
     with pytest.raises(fitact.InputError, match="write a number from 1, or all"):
-        app(["fit", str(path), "--spectrum", "x"])
+        app(["fit", str(path), "--segment", "x"])
 
 
 @pytest.mark.parametrize("name", GAINS)

@@ -37,7 +37,7 @@ class Layout:
     taken: str
     write: Callable[[Path], Path] | None = None
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    kind: Literal["text", "binary", "array", "sound", "spectrum"] = "text"
+    kind: Literal["text", "binary", "array", "sound", "sheet", "spectrum"] = "text"
     extra: str = ""
     real: tuple[str, ...] = ()
     resolution: float = 1e-7

@@ -13,6 +13,7 @@ import pytest
 import scipy.io
 import xarray
 
+from tests.layouts.files import Cell, raw, write_ods, write_xlsx
 from tests.layouts.layout import COUNT, SCOPE, STEP, TIME, VSC, Layout, V, rows, text
 
 CHS = {"channels": {"V": "CH1", "Vsc": "CH2"}}
@@ -208,6 +209,35 @@ def write_wav(folder: Path) -> Path:
     return folder / "card.wav"
 
 
+LVM_HEAD, SEGMENT = "LabVIEW Measurement\nX_Columns\tOne\n***End_of_Header***\n\n", LVM.split("\n", 2)[2]
+RUNS = ["\n".join(rows(TIME, n * V, n * VSC, delimiter="\t")) for n in (2, 1, 3)]
+SECOND = {"segment": 2}
+NODES = {"channels": {"V": "V(drive)", "Vsc": "V(skin)"}}
+
+
+def spice_file(form: str) -> Callable[[Path], Path]:
+    """Return the writer of a raw file of a transient analysis."""
+    waves = {"V(drive)": ("voltage", V), "V(skin)": ("voltage", VSC)}
+
+    def write(folder: Path) -> Path:
+        (folder / "a.raw").write_bytes(raw([(TIME, waves)], form, "real forward"))
+        return folder / "a.raw"
+
+    return write
+
+
+def _sheet() -> list[list[Cell]]:
+    return [NAMES.split(","), *(list(map(float, row)) for row in zip(TIME, V, VSC, strict=True))]
+
+
+def write_sheet(folder: Path) -> Path:
+    return write_xlsx(folder / "a.xlsx", _sheet())
+
+
+def write_open_sheet(folder: Path) -> Path:
+    return write_ods(folder / "a.ods", _sheet())
+
+
 UNITS, TIMES, GRID, CLOCK = "time, units", "time", "time step, units", "time of day"
 ATTENUATION, VARIANT = "time, units, attenuation", "as without"
 SCOPE_FILES = {"kind": "binary", "extra": "scope"}
@@ -217,26 +247,45 @@ RECORDS: tuple[Layout, ...] = (
     Layout("numpy.savetxt", ".txt", UNITS, text(table("# time_s V_V Vsc_V", delimiter=" "))),
     Layout("LabVIEW", ".lvm", UNITS, text(LVM + "\n".join(rows(TIME, V, VSC, delimiter="\t")))),
     Layout(
+        "LabVIEW", ".lvm", UNITS,
+        text(LVM.replace("V\tVsc", "V\tX_Value\tVsc") + "\n".join(rows(TIME, V, TIME, VSC, delimiter="\t"))),
+    ),
+    Layout(
+        "Origin", ".dat", UNITS,
+        text("Time\tV\tVsc\nus\tV\tV\nComments\tdrive\tskin\n" + "\n".join(rows(1e6 * TIME, V, VSC, delimiter="\t"))),
+    ),
+    Layout(
         "LabVIEW without times", ".lvm", GRID,
         text(LVM.replace("One", "No") + "\n".join("\t" + row for row in rows(V, VSC, delimiter="\t"))),
     ),
     Layout("time stamps", ".csv", CLOCK, text(with_clock(",V_V,Vsc_V", [f"2025-03-04 {c}" for c in clocks()]))),
     Layout(
-        "ISO stamps", ".csv", CLOCK,
+        "time stamps", ".csv", CLOCK,
         text(with_clock("when,V_V,Vsc_V", [f"2025-03-04T{c}+01:00" for c in clocks()])),
     ),
     Layout(
-        "date and clock", ".csv", CLOCK,
+        "clocks", ".csv", CLOCK,
         text(with_clock("Date,Time,V (V),Vsc (V)", [f"04/03/2025,{c}" for c in clocks()])),
     ),
-    Layout("twelve-hour clock", ".csv", CLOCK, text(with_clock("Time,V_V,Vsc_V", half_past(clocks())))),
+    Layout("clocks", ".csv", CLOCK, text(with_clock("when,V_V,Vsc_V", [f"04-Mar-2025 {c}" for c in clocks()]))),
     Layout(
-        "German clock", ".csv", CLOCK,
+        "clocks", ".csv", CLOCK,
+        text(with_clock("Time,V_V,Vsc_V", [c[3:] for c in clocks(begin=9.0)])),
+    ),
+    Layout(
+        "clocks", ".csv", CLOCK, text(with_clock("Time,V_V,Vsc_V", [c.replace(".", ":") for c in clocks()])),
+    ),
+    Layout("clocks", ".csv", CLOCK, text(with_clock("Time,V_V,Vsc_V", half_past(clocks())))),
+    Layout(
+        "clocks", ".csv", CLOCK,
         text(with_clock("Zeit;V_V;Vsc_V", clocks(), delimiter=";").replace(".", ",")),
     ),
     Layout(
-        "clock of whole seconds", ".csv", "-", text(with_clock("Time,V_V,Vsc_V", [c[:8] for c in clocks(begin=1.0)])),
+        "coarse clocks", ".csv", "-", text(with_clock("Time,V_V,Vsc_V", [c[:8] for c in clocks(begin=1.0)])),
         RATE,
+    ),
+    Layout(
+        "coarse clocks", ".csv", "-", text(with_clock("Time,V_V,Vsc_V", [c[3:10] for c in clocks(begin=9.0)])), RATE,
     ),
     Layout("columns without time", ".csv", "-", text(table("V_V,Vsc_V", V, VSC)), RATE),
     Layout(
@@ -327,6 +376,17 @@ RECORDS: tuple[Layout, ...] = (
     Layout("LabVIEW", ".tdms", UNITS, write_tdms, NAMED, "binary", "tdms"),
     Layout("MATLAB", ".mat", "time or step", write_mat, NAMED, "array"),
     Layout("MATLAB", ".mat", "time or step", write_mat_73, NAMED, "array"),
+    Layout("LabVIEW segments", ".lvm", UNITS, text(LVM_HEAD + "\n\n".join(SEGMENT + each for each in RUNS)), SECOND),
+    Layout("time that starts anew", ".csv", UNITS, text("\n".join([NAMES.replace(",", "\t"), *RUNS])), SECOND),
+    Layout(
+        "LTspice's steps", ".txt", TIMES,
+        text("time\tV(a)\tV(b)\n" + "\n".join(f"Step Information: R={n}K\n{run}" for n, run in enumerate(RUNS))),
+        {**SECOND, "channels": {"V": "V(a)", "Vsc": "V(b)"}},
+    ),
+    Layout("LTspice", ".raw", UNITS, spice_file("mixed"), NODES, "binary"),
+    Layout("ngspice", ".raw", UNITS, spice_file("text"), NODES, "binary"),
+    Layout("Excel", ".xlsx, .xls", UNITS, write_sheet, kind="sheet", extra="excel"),
+    Layout("OpenDocument", ".ods", UNITS, write_open_sheet, kind="sheet", extra="excel"),
     Layout("HDF5", ".h5", UNITS, write_hdf5, NAMED, "array"),
     Layout("NetCDF", ".nc", UNITS, write_netcdf, NAMED, "array"),
     Layout("NetCDF", ".nc", UNITS, write_netcdf3, NAMED, "array"),

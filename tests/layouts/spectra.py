@@ -60,6 +60,12 @@ FILES = {
         "{f:.9g}, 0.1, 0, 1, {re:.9g}, {im:.9g}, 0, 0",
     ),
     "words.csv": ("frequency,real,imaginary", "{f:.9g},{re:.9g},{im:.9g}"),
+    "chip.csv": (",Frequency,Impedance,Phase", "{n},{f:.9g},{size:.9g},{deg_point}"),
+    "registers.csv": (
+        "Frequency,Impedance,Phase,Real,Imaginary,Magnitude",
+        "{f:.9g},{size:.9g},{deg_point},-16103,-1843,16208.12",
+    ),
+    "powersuite.txt": ("Frequency\t Zre\t Zimg", "{f:.9g}\t {re:.9g}\t {im:.9g}"),
     "primes.csv": ("f, Z', Z''", "{f:.9g}, {re:.9g}, {im:.9g}"),
     "count.i2b": ("Some metadata\nof several lines\n\n41", "{f:.9g} {re:.9g} {im:.9g}"),
     "powersuite.P00": (
@@ -88,6 +94,7 @@ PROGRAMS: dict[str, tuple[str, ...]] = {
     "quoted.z": ("ZPlot", "impedance_py/exampleDataZPlot_noComments.z"),
     "versastudio.par": ("VersaStudio", "impedance_py/exampleDataVersaStudio.par"),
     "parstat.txt": ("Parstat", "impedance_py/exampleDataParstat.txt"),
+    "chip.csv": ("AD5933",), "registers.csv": ("AD5933",), "powersuite.txt": ("PowerSuite",),
     "count.i2b": ("Elchemea", "pyimpspec/data.i2b"), "powersuite.P00": ("PowerSuite", "pyimpspec/data.P00"),
     "ecochemie.dfr": ("Ecochemie", "pyimpspec/data.dfr"),
     "ivium.idf": ("Ivium", "pyimpspec/data.idf", "pyimpspec/data.ids"),

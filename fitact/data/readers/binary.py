@@ -5,23 +5,25 @@ Optional parsers are imported where they are used. Any error of a parser becomes
 
 import contextlib
 import dataclasses
-import importlib
 import io
 import logging
 import re
-import types
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import lazy_loader
 import numpy as np
 
 from fitact.data.readers import layouts
 from fitact.data.readers.capture import FULL_SCALE, Capture, FileChannel, Pick
+from fitact.data.readers.extras import import_extra
 from fitact.data.readers.matlab import read_mat
+from fitact.data.readers.segments import choose_segment, select_segment
+from fitact.data.readers.spice import is_spice, read_spice
 from fitact.errors import RATE_OPTION, InputError
+from fitact.files import read_head
 
 h5py, scipy = lazy_loader.load("h5py"), lazy_loader.load("scipy")
 
@@ -57,10 +59,12 @@ def is_known_binary(head: bytes, suffix: str) -> bool:
     return _find_reader(head, "" if suffix.lower() in (".csv", ".txt") else suffix) is not None
 
 
-def read_binary(path: Path, source: str, head: bytes, pick: Pick, rate: float | None = None) -> Capture:
+def read_binary(
+    path: Path, source: str, head: bytes, pick: Pick, rate: float | None = None, segment: int | None = None
+) -> Capture:
     """Return the channels of a binary file that `pick` selects, in SI units.
 
-    `rate` (Hz) gives the times of arrays that state none.
+    `rate` (Hz) gives the times of arrays that state none, `segment` (from 1) chooses one of several.
     """
     reader = _find_reader(head, path.suffix)
     if reader is None:
@@ -69,9 +73,9 @@ def read_binary(path: Path, source: str, head: bytes, pick: Pick, rate: float | 
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # from parsers that continue after a problem
-            if reader is _read_scope:
-                return _read_scope(path, source, pick)
-            return _make_capture(reader(path, source), source, pick, rate)
+            if reader in (_read_scope, read_spice):
+                return reader(path, source, pick, segment)
+            return choose_segment(_make_capture(reader(path, source), source, pick, rate), segment)
     except InputError:
         raise
     except Exception as error:  # a dozen parsers with exceptions of their own
@@ -80,17 +84,25 @@ def read_binary(path: Path, source: str, head: bytes, pick: Pick, rate: float | 
 
 
 def _find_reader(head: bytes, suffix: str) -> Callable[..., Any] | None:
-    """Return `_read_scope`, or the function of path and source that reads the contents of the file, or None."""
+    """Return `_read_scope`, `read_spice`, or the function of path and source that reads the contents, or None."""
     readers = {
         b"\x89HDF\r\n\x1a\n": _read_hdf5, b"CDF": _read_netcdf3, b"TDSm": _read_tdms, b"PK\x03\x04": _read_npz,
         b"MATLAB 7.3": _read_hdf5, b"MATLAB": _read_mat, b"RIFF": _read_wav,
     }  # fmt: skip
+    if is_spice(head):
+        return read_spice
     scope = _read_scope if _SCOPE.search(head) or suffix.lower() in _SCOPE_SUFFIXES else None
     return next((reader for start, reader in readers.items() if head.startswith(start)), scope)
 
 
-def _read_scope(path: Path, source: str, pick: Pick) -> Capture:
-    wfm = _import_extra("RigolWFM.wfm", "scope", source).Wfm.from_file(str(path))
+def _read_scope(path: Path, source: str, pick: Pick, segment: int | None) -> Capture:
+    reader = import_extra("RigolWFM.wfm", "scope", source).Wfm
+    if read_head(path, 2) == b"AG" and (capture := _read_keysight_segment(path, source, pick, segment)):
+        return capture
+    wfm = reader.from_file(str(path))
+    if getattr(wfm, "frame_count", 1) > 1:  # FastFrame of Tektronix
+        wfm = reader.from_file(str(path), frame=select_segment(segment, wfm.frame_count, source))
+        segment = None
     if not wfm.channels:
         raise InputError(f"{source}: holds no analogue channel; export one")
     names = [str(channel.name) for channel in wfm.channels]
@@ -106,7 +118,38 @@ def _read_scope(path: Path, source: str, pick: Pick) -> Capture:
             times.append(np.asarray(channel.times, dtype=float))
     _check_one_grid(times, [channel.name for channel in channels], source)
     maker, unread = str(wfm.header_name) or "oscilloscope", tuple(name for name in names if name not in wanted)
-    return Capture(source, maker, times[0], tuple(channels), unread_columns=unread)
+    capture = Capture(source, maker, times[0], tuple(channels), unread_columns=unread)
+    parts = choose_segment(capture, segment, _count_sequence(path))
+    return dataclasses.replace(parts, time=times[0][: parts.time.size])  # since the trigger of the segment
+
+
+def _read_keysight_segment(path: Path, source: str, pick: Pick, segment: int | None) -> Capture | None:
+    """Return one segment of Keysight's segmented memory, which RigolWFM parses but does not convert, or None."""
+    contents = import_extra("RigolWFM.agilent_agxx_bin", "scope", source).AgilentAgxxBin.from_file(str(path))
+    floats = [each for each in contents.waveforms if each.buffers and each.buffers[0].data_header.buffer_type == 1]
+    numbers = sorted({each.wfm_header.segment_index for each in floats})
+    if numbers in ([], [0]):
+        return None
+    number = numbers[select_segment(segment, len(numbers), source)]
+    here = [each for each in floats if each.wfm_header.segment_index == number]
+    chosen = {f"CH {each.wfm_header.waveform_label.strip()}": each for each in here}
+    wanted = [name for name in chosen if name in set(pick(list(chosen), ""))]
+    units, header = {1: "V", 4: "A"}, chosen[wanted[0]].wfm_header
+    values = {name: np.frombuffer(chosen[name].buffers[0].data_raw, "<f4").astype(float) for name in wanted}
+    channels = [FileChannel(name, values[name], units.get(int(chosen[name].wfm_header.y_units), "")) for name in wanted]
+    time = header.x_origin + header.x_increment * np.arange(header.n_pts)
+    for name in wanted:
+        if values[name].size != time.size:
+            raise InputError(f"{source}: {name} has {values[name].size:,} of {time.size:,} samples; export it again")
+    return Capture(source, "Keysight", time, tuple(channels), unread_columns=tuple(set(chosen) - set(wanted)))
+
+
+def _count_sequence(path: Path, place: int = 144) -> int:
+    """Return the number of segments in LeCroy's sequence mode, `place` bytes into its WAVEDESC, or 1."""
+    _, mark, block = read_head(path).partition(b"WAVEDESC")
+    start = place - len(mark)
+    order: Literal["little", "big"] = "little" if block[34 - len(mark) : 35 - len(mark)] == b"\1" else "big"
+    return int.from_bytes(block[start : start + 4], order) if mark and block[8:].startswith(b"LECROY_2") else 1
 
 
 def _read_wav(path: Path, source: str) -> _Contents:
@@ -122,7 +165,7 @@ def _read_wav(path: Path, source: str) -> _Contents:
 
 
 def _read_tdms(path: Path, source: str) -> _Contents:
-    nptdms = _import_extra("nptdms", "tdms", source)
+    nptdms = import_extra("nptdms", "tdms", source)
     with _capture_log("nptdms") as said, nptdms.TdmsFile.open(path) as file:
         pairs = [(group, channel) for group in file.groups() for channel in group.channels()]
         channels = {channel.name: channel for _, channel in pairs}
@@ -284,13 +327,3 @@ def _check_size(size: int, path: Path, source: str) -> None:
 
 def _to_text(value: Any) -> str:
     return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
-
-
-def _import_extra(module: str, extra: str, source: str) -> types.ModuleType:
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise InputError(
-            f"{source}: needs {module.partition('.')[0]}, which is not installed; pip install 'fitact[{extra}]', or"
-            " export the record as CSV"
-        ) from error

@@ -38,7 +38,7 @@ class FileChannel:
     ) -> "FileChannel":
         """Convert values in the file's unit."""
         unit, factor = parse_unit(unit_text) or ("", 1.0)
-        return cls(name, values * factor if unit else values, unit, unit_text, attenuation, location)
+        return cls(name, values * factor if factor != 1.0 else values, unit, unit_text, attenuation, location)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,7 +129,7 @@ def channel_arrays(
     for channel, name in known.items():
         trace = capture.channels[names.index(name)]
         _check_unit(trace, channel, channel in scale, capture.source)
-        arrays[channel] = trace.values * scale.get(channel, 1.0)
+        arrays[channel] = trace.values * scale[channel] if channel in scale else trace.values
         if channels or scale:
             notes.append(f"{capture.source}: {_describe_conversion(trace, channel, scale.get(channel, 1.0))}")
     return arrays, known, notes

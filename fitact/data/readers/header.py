@@ -14,6 +14,7 @@ from fitact.errors import RATE_OPTION, InputError
 
 _EXAMPLE = "time_s,V_V,Vsc_V,I_A"
 MINUS = "\N{MINUS SIGN}"  # as typeset, in place of the hyphen
+_OUT_OF_RANGE = ("∞", "ol", "ovld", "over", "overflow", "overrange", "1.#inf")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 _QUANTITY = re.compile(r"(?:analog:)?\s*([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*([a-zµμ]*)", re.IGNORECASE)
 
@@ -55,9 +56,6 @@ def read_header(
     maker = next((maker for maker, mark in layouts.MAKERS if mark.search(head)), "text")
     numeric, is_clock = header.numeric | header.standard_columns(), is_clock and header.clock is not None
     header = dataclasses.replace(header, numeric=numeric, maker=maker, rate=rate, is_clock=is_clock)
-    segments = header.find_values(layouts.SEGMENT_KEYS)[:1]
-    if segments and (parse_number(segments[0], header.decimal_comma) or 1.0) > 1.0:
-        raise InputError(f"{source}: holds {segments[0]} segments; export one of them")
     if header.time is None and header.time_grid[1] is None:
         count = len(header.numeric)
         found = f"{count} column{'s' * (count > 1)} of numbers" + ("" if header.names else " without names")
@@ -89,7 +87,8 @@ def parse_number(cell: str, decimal_comma: bool) -> float | None:
     try:
         return float(cell.replace(",", ".") if decimal_comma else cell)
     except ValueError:
-        return {"∞": float("inf"), "-∞": -float("inf")}.get(cell)
+        size = math.inf if cell.lstrip("+-").lower() in _OUT_OF_RANGE else None
+        return -size if size and cell.startswith("-") else size
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,6 +102,7 @@ class Header:
     data_rows: list[TextRow]
     numeric: frozenset[int]  # indices of the columns of numbers
     source: str
+    first_line: str = ""  # if it has words, of which another copy begins another segment
     maker: str = "text"
     rate: float | None = None  # stated by the user, Hz
     is_clock: bool = False  # whether the time column holds seconds since midnight
@@ -133,7 +133,15 @@ class Header:
         end = data[first].number if first < len(data) else len(lines)
         comments = [row for row in rows if row.cells[0].startswith("#") and row.number < end]
         comments += [TextRow(0, line.split(":")) for line in sidecar_text.splitlines()]
-        return cls(delimiter, decimal_comma, comments, data[:first], data[first:], numeric, source)
+        if delimiter == " " and first < len(data):  # names of several words stand apart by two blanks
+            wide = {n: re.split(r"\s{2,}|\t+", line.strip()) for n, line in lines[: end - 1]}
+            width = len(data[first].cells)
+            data = [
+                TextRow(row.number, wide[row.number]) if len(wide.get(row.number, ())) == width else row for row in data
+            ]
+        first_line = text.partition("\n")[0].replace('"', "").strip()
+        first_line = first_line if re.match(r"\W*[A-Za-z]", first_line) and data[:first] else ""
+        return cls(delimiter, decimal_comma, comments, data[:first], data[first:], numeric, source, first_line)
 
     @property
     def is_plain(self) -> bool:
@@ -190,6 +198,8 @@ class Header:
     def names(self) -> TextRow | None:
         """Row of names, above the row of units if there is one; numpy.savetxt writes it as a comment."""
         rows = [row for row in self.header_rows if len(row.cells) > max(self.numeric) and row is not self.units]
+        if self.units and rows and rows[-1].number > self.units.number and not self._names_time(rows[-1]):
+            rows = [row for row in rows if row.number < self.units.number]  # Origin writes comments below the units
         if rows and self._is_names(rows[-1]):
             return rows[-1]
         if self.comments and self.comments[-1].number and not self.units:
@@ -202,21 +212,28 @@ class Header:
 
     def _is_names(self, row: TextRow) -> bool:
         here = [row.cells[i] for i in sorted(self.numeric)]
-        if any(layouts.split_name_and_unit(cell)[0].lower() in layouts.TIME_NAMES for cell in here if cell):
+        if self._names_time(row):
             return True  # although the other cells may be numbers (Keysight)
         if all(re.fullmatch(r"[\d:./ -]+", cell) for cell in here):  # dates or clock times
             return False
         return any(here) and all(parse_number(cell, self.decimal_comma) is None for cell in here)
 
+    def _names_time(self, row: TextRow) -> bool:
+        here = [row.cells[i] for i in sorted(self.numeric)]
+        return any(layouts.split_name_and_unit(cell)[0].lower() in layouts.TIME_NAMES for cell in here if cell)
+
     @functools.cached_property
     def units(self) -> TextRow | None:
-        row = self.header_rows[-1] if self.header_rows else None
-        if row is None or len(row.cells) <= max(self.numeric):
-            return None
+        """Row of units, the last of the header or the last but one."""
+        return next((row for row in self.header_rows[:-3:-1] if self._is_units(row)), None)
+
+    def _is_units(self, row: TextRow) -> bool:
+        if len(row.cells) <= max(self.numeric):
+            return False
         here = [row.cells[i] for i in sorted(self.numeric)]
         known = [bool(layouts.parse_unit(cell)) or cell[:1] + cell[-1:] in ("()", "[]") for cell in here]
         rest = [cell.lower() in layouts.NOT_UNITS for cell in here]
-        return row if any(known) and all(a or b for a, b in zip(known, rest, strict=True)) else None
+        return any(known) and all(a or b for a, b in zip(known, rest, strict=True))
 
     @functools.cached_property
     def time_grid(self) -> tuple[float | None, float | None]:
@@ -267,6 +284,7 @@ class Header:
     def channels(self) -> list[Column]:
         """Columns of values, with names and units that the header states elsewhere."""
         columns = [c for c in self._columns if c.place not in (self.index, self.time.place if self.time else None)]
+        columns = [column for column in columns if not self._is_time_again(column)]
         names = [column.name for column in columns]
         if "" in names or (len(set(names)) < len(names) and not any(layouts.is_standard_name(name) for name in names)):
             names = self._find_names(len(names)) or [f"column {column.place + 1}" for column in columns]
@@ -276,6 +294,19 @@ class Header:
             Column(c.place, names[i], c.unit or units[min(i, len(units) - 1)], probes[i] if i < len(probes) else None)
             for i, c in enumerate(columns)
         ]
+
+    def _is_time_again(self, column: Column) -> bool:
+        """Return whether a column repeats the times under their name, as LabVIEW does; refuse others there."""
+        if self.time is None or not column.name or column.name != self.time.name:
+            return False
+        places = self.time.place, column.place
+        pairs = [[row.cells[i] for i in places] for row in self.data_rows if len(row.cells) > max(places)]
+        if any(a != b for a, b in pairs):
+            raise InputError(
+                f"{self.source}{self.location}: the columns {places[0] + 1} and {places[1] + 1} hold different times;"
+                " export channels of one time base"
+            )
+        return True
 
     def standard_columns(self) -> frozenset[int]:
         """Return the columns with fitact's own names, which must hold numbers."""
@@ -293,6 +324,11 @@ class Header:
         """Return the number of rows that the header states, or None."""
         count = self.find_quantity(layouts.COUNT_KEYS)
         return int(count) if count is not None and count < 1e12 else None  # a larger number has another meaning
+
+    def count_segments(self) -> int:
+        """Return the number of segments that the header states, or 1."""
+        counts = [self._parse_quantity(text) for text in self.find_values(layouts.SEGMENT_KEYS)[:1]]
+        return int(counts[0]) if counts and counts[0] and 1.0 < counts[0] < 1e6 else 1
 
     def _find_names(self, count: int) -> list[str]:
         """Return channel names from lines such as "Source,CH1" or "Vertical Scale,CH1:0.05 CH2:0.10"."""

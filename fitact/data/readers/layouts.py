@@ -92,7 +92,7 @@ def convert_time(time: np.ndarray, unit_text: str, place: str, remedy: str) -> n
     unit = parse_unit(unit_text)
     if unit_text and (unit is None or unit[0] != "s"):
         raise InputError(f"{place}: '{unit_text}' is not a unit of time; {remedy}")
-    return time * (unit[1] if unit else 1.0)
+    return time * unit[1] if unit and unit[1] != 1.0 else time
 
 
 def is_same_grid(time: np.ndarray, other: np.ndarray) -> bool:

@@ -19,6 +19,8 @@ from fitact.data.readers.capture import (
 )
 from fitact.data.readers.layouts import is_same_grid
 from fitact.data.readers.spectrum import is_spectrum, read_spectrum
+from fitact.data.readers.spice import is_ac_analysis
+from fitact.data.readers.spreadsheet import is_spreadsheet
 from fitact.data.readers.text import PADDING, is_binary, read_text
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.data.spectrum import Spectrum
@@ -42,7 +44,7 @@ def read_any(path: str | os.PathLike[str], scene: "Scene | None" = None, **colum
     try:
         return read(path, scene, **columns)
     except SpectrumFileError:
-        return read_spectrum(path)
+        return read_spectrum(path, columns.get("segment"))
 
 
 def read(
@@ -52,15 +54,17 @@ def read(
     channels: Mapping[str, str] | None = None,
     scale: Mapping[str, float] | None = None,
     rate: float | None = None,
+    segment: int | None = None,
 ) -> Record:
     """Read a record: a CSV file with the columns time_s, V_V, Vsc_V, I_A and Ft_N, or a file of an oscilloscope.
 
-    `channels` assigns the names in the file, e.g. {"Vsc": "CH2"}; the names V, Vsc, I and Ft need none. If each
-    channel has its own file, {"Vsc": "CH2", "V": "C1.trc:CH1"} reads V from another file in the same folder. `scale`
-    multiplies a channel, e.g. {"Vsc": 10} for a 10x probe that was not set on the oscilloscope. `rate` (Hz), or else a
-    sampling rate that the scene states, replaces times that were rounded when they were written. Units in the header
-    are applied, and assumptions are listed in the record's notes. With a `scene`, its measured channels are required,
-    and V may be absent if the scene states the drive. docs/input.md lists the layouts.
+    `channels` assigns the names in the file, e.g. {"Vsc": "CH2"}; the names V, Vsc, I and Ft need none. If each channel
+    has its own file, {"Vsc": "CH2", "V": "C1.trc:CH1"} reads V from another file in the same folder. `scale` multiplies
+    a channel, e.g. {"Vsc": 10} for a 10x probe that was not set on the oscilloscope. `rate` (Hz), or else a sampling
+    rate that the scene states, replaces times that were rounded when they were written. `segment` (from 1) chooses one
+    of the runs, steps, frames or sheets of a file that holds several. Units in the header are applied, and assumptions
+    are listed in the record's notes. With a `scene`, its measured channels are required, and V may be absent if the
+    scene states the drive. docs/input.md lists the layouts.
 
     Raises:
         InputError: the file cannot be read, or its data are invalid; the message names the line and a remedy.
@@ -73,8 +77,9 @@ def read(
     def pick(names: list[str], place: str) -> Iterable[str]:
         return resolve_channels(names, local_columns, source, place).values()
 
-    capture = read_capture(path, pick, rate or scene_rate)
-    capture = replace_rounded_times(merge_other_files(capture, path, channels, rate or scene_rate), rate, scene_rate)
+    capture = read_capture(path, pick, rate or scene_rate, segment)
+    capture = merge_other_files(capture, path, channels, rate or scene_rate, segment)
+    capture = replace_rounded_times(capture, rate, scene_rate)
     record = to_record(capture, channels, scale or {})
     for channel in scene.measurement.channels if scene else ("Vsc",):
         record[channel]  # raises InputError if missing
@@ -88,36 +93,45 @@ def read(
 
 
 def read_capture(
-    path: str | os.PathLike[str], pick: Pick = lambda names, place: names, rate: float | None = None
+    path: str | os.PathLike[str],
+    pick: Pick = lambda names, place: names,
+    rate: float | None = None,
+    segment: int | None = None,
 ) -> Capture:
     """Return time and channels of a file, by the names in the file; `pick` may select some of them.
 
-    `rate` (Hz) gives the times of a file that states none.
+    `rate` (Hz) gives the times of a file that states none, `segment` (from 1) chooses one of several.
     """
     source, path = os.fspath(path), Path(path)
     head = read_head(path)
     if not head.strip():
         raise InputError(f"{source}: the file holds no data; record again, or export it again as CSV")
     if head[:2] == b"\x1f\x8b":
-        return read_text(path, source, pick, rate)
-    if is_binary(head.rstrip(PADDING)) or is_known_binary(head, path.suffix):
-        return read_binary(path, source, head, pick, rate)
-    if is_spectrum(path):
+        return read_text(path, source, pick, rate, segment)
+    binary = is_binary(head.rstrip(PADDING)) or is_known_binary(head, path.suffix)
+    binary = binary and not is_spreadsheet(path)
+    if is_ac_analysis(path) if binary else is_spectrum(path):
         raise SpectrumFileError(
             f"{source}: is a spectrum, without time, and this needs a record in time; give a record, or read it with"
             " fitact.read_spectrum, as fitact inspect and fitact fit do"
         )
-    return read_text(path, source, pick, rate)
+    if binary:
+        return read_binary(path, source, head, pick, rate, segment)
+    return read_text(path, source, pick, rate, segment)
 
 
 def merge_other_files(
-    capture: Capture, path: str | os.PathLike[str], channels: Mapping[str, str], rate: float | None = None
+    capture: Capture,
+    path: str | os.PathLike[str],
+    channels: Mapping[str, str],
+    rate: float | None = None,
+    segment: int | None = None,
 ) -> Capture:
     """Return the capture with the columns of other files that `channels` names as FILE:COLUMN added."""
     traces = list(capture.channels)
     for requested in channels.values():
         if found := _locate_file_column(path, requested):
-            other = _read_column(*found, rate)
+            other = _read_column(*found, rate, segment)
             if not is_same_grid(capture.time, other.time):
                 raise InputError(
                     f"{capture.source}: {found[0]} has a different length or different times, so it does not belong to"
@@ -127,8 +141,8 @@ def merge_other_files(
     return dataclasses.replace(capture, channels=tuple(traces))
 
 
-def _read_column(file: Path, column: str, rate: float | None) -> Capture:
-    return read_capture(file, lambda names, _: [find_channel(column, names, str(file))], rate)
+def _read_column(file: Path, column: str, rate: float | None, segment: int | None) -> Capture:
+    return read_capture(file, lambda names, _: [find_channel(column, names, str(file))], rate, segment)
 
 
 def _locate_file_column(path: str | os.PathLike[str], requested: str) -> tuple[Path, str] | None:

@@ -5,13 +5,17 @@ import itertools
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Literal, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 
 from fitact.data.readers.header import parse_number, split_cells
-from fitact.data.spectrum import MINIMUM_POINTS, Spectrum
+from fitact.data.readers.segments import select_segment
+from fitact.data.readers.spice import find_ac_analyses, find_response, is_ac_analysis, read_ac_analyses
+from fitact.data.readers.spreadsheet import is_spreadsheet, read_sheets
+from fitact.data.spectrum import MINIMUM_POINTS, ChannelName, Spectrum
 from fitact.errors import InputError
 from fitact.files import read_head
 from fitact.units import PREFIX_FACTORS, format_engineering
@@ -67,7 +71,7 @@ Rows = Float[np.ndarray, "points columns"]
 class _Layout(NamedTuple):
     """Meaning of the columns of a table."""
 
-    channel: Literal["impedance", "Vsc"]
+    channel: ChannelName
     places: tuple[int, ...]  # columns that must be numbers
     convert: Callable[[Rows], tuple[np.ndarray, np.ndarray]]  # of these columns to frequency (Hz) and response
     doubt: str = ""  # why the table might be two things
@@ -85,34 +89,29 @@ class _Table(NamedTuple):
 def is_spectrum(path: str | os.PathLike[str], head_size: int = 16_384, size: int = 2**22) -> bool:
     """Return whether a file holds a spectrum, by its layout; the numbers are bytes that are read."""
     try:
-        content = read_head(path, head_size)
+        if is_ac_analysis(Path(path)):
+            return True
+        content = _read_text(path, head_size)
         lines = _split_lines(content)
         lines = lines[:-1] if len(content) == head_size else lines
         if _LATE_TABLES.search(lines[0] if lines else ""):
-            lines = _split_lines(read_head(path, size))
-        finders = _find_headers, _find_ac_analyses, _find_listings, _find_blocks
+            lines = _split_lines(_read_text(path, size))
+        finders = _find_headers, find_ac_analyses, _find_listings, _find_blocks
         return any(True for find in finders for _ in find(lines))
     except InputError:
         return False
 
 
-def read_spectrum(path: str | os.PathLike[str], number: int | None = None, shunt: float | None = None) -> Spectrum:
-    """Read one spectrum of a file, the only one or that with this `number`, from 1; see `read_spectra`.
+def read_spectrum(path: str | os.PathLike[str], segment: int | None = None, shunt: float | None = None) -> Spectrum:
+    """Read one spectrum of a file, the only one or that with the number `segment`, from 1; see `read_spectra`.
 
     Raises:
         InputError: as `read_spectra`; also if the file holds different spectra and no number is given.
     """
     spectra = read_spectra(path, shunt)
-    if number is None and len({spectrum.fingerprint for spectrum in spectra}) > 1:
-        raise InputError(
-            f"{os.fspath(path)}: holds {len(spectra)} spectra; choose one, as --spectrum 1 (in Python: number=1)"
-        )
-    if not 1 <= (number or 1) <= len(spectra):
-        raise InputError(
-            f"{os.fspath(path)}: holds {len(spectra)} spectra, so there is no number {number}; choose another with"
-            " --spectrum (in Python: number=1)"
-        )
-    return spectra[(number or 1) - 1]
+    if segment is None and len({spectrum.fingerprint for spectrum in spectra}) == 1:
+        return spectra[0]
+    return spectra[select_segment(segment, len(spectra), os.fspath(path), "spectra")]
 
 
 def read_spectra(path: str | os.PathLike[str], shunt: float | None = None) -> tuple[Spectrum, ...]:
@@ -127,14 +126,16 @@ def read_spectra(path: str | os.PathLike[str], shunt: float | None = None) -> tu
     Raises:
         InputError: the file cannot be read, or holds no spectrum; the message names the line and a remedy.
     """
-    source, lines = os.fspath(path), _split_lines(read_head(path, 2**26))  # bytes, more than any spectrum has
+    source, lines = os.fspath(path), _split_lines(_read_text(path, 2**26))  # bytes, more than any spectrum has
     spectra: list[Spectrum] = []
-    for header in _find_headers(lines):
+    plots = read_ac_analyses(Path(path)) if is_ac_analysis(Path(path)) else find_ac_analyses(lines)
+    for rows, channel, note in (find_response(plot, source) for plot in plots):
+        layout = _Layout(channel, (0, 1, 2), lambda x: (x[:, 0], x[:, 1] + 1j * x[:, 2]), note=note)
+        spectra += _to_spectra(layout, rows, source, shunt)
+    for header in [] if spectra else _find_headers(lines):
         if header.layout.doubt:
             raise InputError(f"{source}, line {header.end}: {header.layout.doubt}")
         spectra += _to_spectra(header.layout, np.array(list(_parse_rows(lines, header, source))), source, shunt)
-    for gains in [] if spectra else _find_ac_analyses(lines):
-        spectra += _to_spectra(_AC_LAYOUT, gains, source, shunt)
     for find in (_find_listings, _find_blocks):
         for block in [] if spectra else find(lines):
             spectra += _to_spectra(_parts_layout((0, 1, 2), ("f", "Z'", "Z''")), block, source, shunt)
@@ -146,38 +147,15 @@ def read_spectra(path: str | os.PathLike[str], shunt: float | None = None) -> tu
     return tuple(spectra)
 
 
+def _read_text(path: str | os.PathLike[str], size: int) -> bytes:
+    return b"\n\n".join(read_sheets(Path(path)))[:size] if is_spreadsheet(Path(path)) else read_head(path, size)
+
+
 def _split_lines(content: bytes) -> list[str]:
     try:
         return content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig").splitlines()
     except UnicodeDecodeError:
         return content.decode("latin-1").splitlines()
-
-
-_AC_LAYOUT = _Layout(
-    "Vsc",
-    (0, 1, 2),
-    lambda x: (x[:, 0], x[:, 1] + 1j * x[:, 2]),
-    note="the gain is that of the AC analysis, for a source of 1 V",
-)
-
-
-def _find_ac_analyses(lines: Sequence[str]) -> Iterator[Rows]:
-    """Yield frequency, real and imaginary part of a voltage in an AC analysis that LTspice exports."""
-    if not lines or not re.match(r"Freq\.\t[^\t]+$", lines[0]):  # one voltage
-        return
-    number = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
-    polar, parts = (re.compile(rf"{number}\t{rest}") for rest in (rf"\({number}dB,{number}\S*\)", f"{number},{number}"))
-    rows = []
-    for line in filter(str.strip, lines[1:]):
-        if match := polar.fullmatch(line.strip()):
-            frequency, decibels, degrees = map(float, match.groups())
-            value = 10.0 ** (decibels / 20.0) * np.exp(1j * np.pi / 180.0 * degrees)
-            rows.append([frequency, value.real, value.imag])
-        elif match := parts.fullmatch(line.strip()):
-            rows.append([float(x) for x in match.groups()])
-        else:
-            return
-    yield np.array(rows, dtype=float).reshape(-1, 3)
 
 
 def _find_listings(lines: Sequence[str]) -> Iterator[Rows]:
@@ -253,13 +231,13 @@ def _parse_rows(lines: Sequence[str], header: _Table, source: str, max_lines: in
 
 def _find_blocks(lines: Sequence[str]) -> Iterator[Rows]:
     """Yield blocks of three numbers in each line, without names above, whose first sweeps like a frequency."""
-    for delimiter in _DELIMITERS:
+    for delimiter in (each for each in _DELIMITERS if any(each in line for line in lines)):
         block: list[list[float]] = []
         above = 0  # cells of the line above the block
         for line in (*lines, ""):
             cells = split_cells(line, delimiter)
-            numbers = [parse_number(cell, delimiter != ",") for cell in cells]
-            if len(cells) == 3 and None not in numbers:
+            numbers = [parse_number(cell, delimiter != ",") for cell in cells] if len(cells) == 3 else [None]
+            if None not in numbers:
                 block.append([number for number in numbers if number is not None])
                 continue
             if len(block) >= MINIMUM_POINTS and above != 3 and is_swept(np.array(block)[:, 0]):
@@ -275,19 +253,22 @@ def is_swept(frequency: np.ndarray, min_ratio: float = 3.0) -> bool:
 
 def _find_layout(names: list[str]) -> _Layout | None:
     """Return the meaning of the columns with these names, or None if they are no spectrum."""
-    frequency = _find_name(_FREQUENCY, names)
+    frequency, size = _find_name(_FREQUENCY, names), _find_name(_MAGNITUDE, names)
+    phases = [i for i, name in enumerate(names) if _PHASE.search(name)]
     if frequency is None:
         return None
+    # where a chip (AD5933) writes its registers beside them, real and imaginary part are counts of a converter
+    is_polar = size is not None and bool(phases) and re.search(r"z|impedance", names[size], re.IGNORECASE)
     for patterns in ((_REAL, _IMAGINARY), (_RESISTANCE, _REACTANCE)):
         real, imaginary = (_find_name(pattern, names) for pattern in patterns)
-        if real is not None and imaginary is not None:
+        bare = real is not None and names[real].lower() in ("real", "re")
+        if real is not None and imaginary is not None and not (bare and is_polar):
             return _parts_layout((frequency, real, imaginary), [names[i] for i in (frequency, real, imaginary)])
     if (pair := _pair_layout(names, frequency)) is not None:
         return pair
-    size, phases = _find_name(_MAGNITUDE, names), [i for i, name in enumerate(names) if _PHASE.search(name)]
     if not phases:
         return None
-    if size is not None and (_OHM.search(names[size]) or "z" in names[size].lower()):
+    if size is not None and (is_polar or _OHM.search(names[size])):
         factor, turn, hertz = _find_factor(_OHM, names[size]), _find_turn(names[phases[0]]), _to_hertz(names[frequency])
         places = frequency, size, phases[0]
         return _Layout("impedance", places, lambda x: (hertz(x[:, 0]), factor * x[:, 1] * np.exp(turn * x[:, 2])))

@@ -32,19 +32,21 @@ def stream_record(
     channels: Mapping[str, str] | None = None,
     scale: Mapping[str, float] | None = None,
     rate: float | None = None,
+    segment: int | None = None,
     follow: float = 0.0,
 ) -> Iterator[Block]:
     """Yield the samples of a record in blocks; arguments as in `read`.
 
     `path` may be "-" for standard input. A text file is read in blocks; with `follow`, until it has not grown for that
-    many seconds. Other files are read at once. `rate` (Hz) replaces the times by a uniform grid.
+    many seconds. Other files, and one `segment` of a file, are read at once. `rate` (Hz) replaces the times by a
+    uniform grid.
 
     Raises:
         InputError: as `read`.
     """
     source, channels, scale = os.fspath(path), channels or {}, scale or {}
-    if source != "-" and not _is_plain_text(Path(path)):
-        record = read(path, channels=channels, scale=scale, rate=rate)
+    if source != "-" and (segment is not None or not _is_plain_text(Path(path))):
+        record = read(path, channels=channels, scale=scale, rate=rate, segment=segment)
         size = 262_144  # samples in a block
         for first in range(0, len(record), size):
             part = slice(first, first + size)

@@ -2,15 +2,17 @@
 
 import bisect
 import contextlib
+import csv
 import dataclasses
 import gzip
 import io
 import math
+import os
 import re
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import IO, NoReturn, cast
+from typing import IO, Any, NoReturn, cast
 
 import numpy as np
 from jaxtyping import Float
@@ -18,7 +20,8 @@ from jaxtyping import Float
 from fitact.data.readers import layouts
 from fitact.data.readers.capture import Capture, FileChannel, Pick
 from fitact.data.readers.header import MINUS, Column, Header, parse_number, read_header, split_cells
-from fitact.errors import RATE_OPTION, InputError
+from fitact.data.readers.segments import SEGMENT, SegmentsError, choose_segment, find_parts, select_segment
+from fitact.errors import RATE_OPTION, SEGMENT_OPTION, InputError
 from fitact.files import read_error
 from fitact.progress import track_progress
 from fitact.units import format_engineering
@@ -27,7 +30,8 @@ PADDING = b"\x00\x1a"  # that some programs write after the text
 _HEAD_BYTES = 32_768  # bytes; enough for any header and some rows
 # a time of day, after which date it may stand; the date counts only by its midnights
 _CLOCK = re.compile(
-    rb"(?:\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}[ T])?(?<!\d)(\d{1,2}):(\d\d):(\d\d(?:\.\d+|,\d+(?=[;\t]))?)"
+    rb"(?:(?:\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}|\d{1,2}[- ][A-Za-z]{3}[- ]\d{2,4})[ T])?"
+    rb"(?<![\d:])(?:(\d{1,2}):)?(\d\d):(\d\d(?:\.\d+|:\d{3}(?:\d{3})?|,\d+(?=[;\t]))?)"
     rb"(?: ?([AaPp])[Mm]|Z|[+-]\d\d:?\d\d)?"
 )
 _DAY = 86_400.0  # s
@@ -37,24 +41,40 @@ BLOCK_BYTES = 8_388_608  # parsed in one block
 
 
 def read_text(
-    path: Path, source: str, pick: Pick, rate: float | None = None, max_bytes: int = 4_294_967_296
+    path: Path,
+    source: str,
+    pick: Pick,
+    rate: float | None = None,
+    segment: int | None = None,
+    max_bytes: int = 4_294_967_296,
 ) -> Capture:
     """Return the columns of a text file (plain or gzip) that `pick` selects, in SI units.
 
-    `rate` (Hz) gives the times of a file that states none. Text of more than `max_bytes` is refused; it indicates a
-    damaged gzip file.
+    `rate` (Hz) gives the times of a file that states none, `segment` (from 1) chooses one of several. Text of more
+    than `max_bytes` is refused; it indicates a damaged gzip file.
     """
+    parts: list[tuple[bytes, int]] = []
     try:
         with _open_text(path, max_bytes) as (stream, file):
+            parts = find_parts(path, stream, segment, max_bytes)
+            if parts:
+                stream = io.BytesIO(parts[select_segment(segment, len(parts), source) if len(parts) > 1 else 0][0])
             head = stream.read(_HEAD_BYTES)
             stream.seek(0)
             table = _TableParser.from_head(head.rstrip(PADDING), source, pick, read_sidecar(path), rate)
-            blocks = _blocks(iter(lambda: stream.read(BLOCK_BYTES), b""), source, max_bytes)
-            for block in track_progress(blocks, f"reading {source}", path.stat().st_size, file.tell):
-                table.add(block)
+            table.line_shift = parts[(segment or 1) - 1][1] if len(parts) > 1 else 0
+            if stream is not file or not table.add_file(path):
+                blocks = _blocks(iter(lambda: stream.read(BLOCK_BYTES), b""), source, max_bytes)
+                for block in track_progress(blocks, f"reading {source}", path.stat().st_size, file.tell):
+                    table.add(block)
+    except SegmentsError:
+        with _open_text(path, max_bytes) as (stream, file):
+            select_segment(segment, max(2, len(find_parts(path, stream, 1, max_bytes))), source)
+        raise
     except (OSError, EOFError, zlib.error) as error:
         raise read_error(source, error) from error
-    return table.to_capture()
+    capture = table.to_capture()
+    return capture if len(parts) > 1 else choose_segment(capture, segment, table.count_segments())
 
 
 def stream_text(
@@ -134,8 +154,13 @@ def _decode(head: bytes, source: str) -> str:
 def _write_seconds(clock: re.Match[bytes]) -> bytes:
     """Return a time of day as seconds since midnight."""
     hours, minutes, seconds, half = clock.groups()
+    if hours is None:  # as Excel shows times, with minutes, seconds and decimals
+        if not re.search(rb"[.,]", seconds):
+            return clock[0]
+        hours = b"0"
+    seconds = re.sub(rb"[,:]", b".", seconds)
     hour = int(hours) if half is None else int(hours) % 12 + 12 * (half in b"Pp")
-    return b"%.9f" % (3600.0 * hour + 60.0 * int(minutes) + float(seconds.replace(b",", b".")))
+    return b"%.9f" % (3600.0 * hour + 60.0 * int(minutes) + float(seconds))
 
 
 def _join_thousands(text: bytes) -> bytes:
@@ -170,6 +195,7 @@ class _TableParser:
         self._blank_rows: list[int] = []  # rows with a time but no values
         self._footer: list[tuple[int, str]] = []  # lines of words below the rows, with their numbers
         self._next_line = 1
+        self.line_shift = 0  # lines left out between header and rows
         self._has_thousands = False  # whether quoted numbers have commas between their thousands
         self._clock_start: float | None = None  # first time of day, s
         self._clock_end = 0.0  # last time since the first midnight, s
@@ -181,7 +207,7 @@ class _TableParser:
         """Make the parser of the columns that `pick` selects, by the header in the first `_HEAD_BYTES` of a text."""
         has_thousands = re.search(rb'"[-+]?\d{1,3}(?:,\d{3})+\.\d+"', head) is not None
         head = _join_thousands(head) if has_thousands else head
-        is_clock = 2 * len(re.findall(rb"(?m)^.*\d:\d\d:\d\d", head)) > head.count(b"\n")
+        is_clock = 2 * len(re.findall(rb"(?m)^.*(?:\d:\d\d:\d\d|\b\d\d:\d\d[.,]\d)", head)) > head.count(b"\n")
         text = _decode(_CLOCK.sub(_write_seconds, head) if is_clock else head, source)
         text = text if len(head) < _HEAD_BYTES else text.rpartition("\n")[0]
         header = read_header(text, source, sidecar_text, rate, is_clock=is_clock)
@@ -198,8 +224,10 @@ class _TableParser:
             if len(parts) <= skipped:
                 return
             first, block = first + skipped, parts[skipped]
+        first += self.line_shift
         block = _join_thousands(block) if self._has_thousands else block
-        block = block.replace(b"\r", b"").replace(b'"', b"").rstrip(PADDING).replace(MINUS.encode(), b"-")
+        block = block.replace(b"\r", b"").replace(b'"', b"").rstrip(PADDING)
+        block = block if block.isascii() else block.replace(MINUS.encode(), b"-")
         block = _CLOCK.sub(_write_seconds, block) if self._header.is_clock else block
         if self._header.delimiter == " ":
             block = re.sub(rb"(?m)^ +| +$", b"", re.sub(rb"[ \t]+", b" ", block))
@@ -207,9 +235,32 @@ class _TableParser:
         if numbers is None:
             numbers, lines = self._parse_line_by_line(block, first)
         if len(numbers):
-            self._parts.append(numbers)
-            self._lines.append(lines or range(first, first + len(numbers)))
-            self._starts.append(self._starts[-1] + len(numbers))
+            self._add_rows(numbers, lines or range(first, first + len(numbers)))
+
+    def _add_rows(self, numbers: np.ndarray, lines: Sequence[int]) -> None:
+        self._parts.append(numbers)
+        self._lines.append(lines)
+        self._starts.append(self._starts[-1] + len(numbers))
+
+    def add_file(self, path: Path, large: int = 1_048_576) -> bool:
+        """Add all rows of a plain file above `large` bytes at once; return whether each has a number in every cell.
+
+        Nothing else is done to the text, which costs as much as to parse it. A last column may be empty, as behind a
+        delimiter at the end of each line.
+        """
+        header = self._header
+        words, last = set(range(header.width)) - header.numeric, header.width - 1
+        is_empty = words <= {last} and not any("".join(row.cells[last:]) for row in header.data_rows if words)
+        if path.stat().st_size <= large or header.delimiter == " " or header.is_clock or not is_empty:
+            return False
+        skipped = header.data_rows[0].number - 1
+        numbers = self._parse_large(
+            os.fspath(path), skiprows=skipped, decimal="," if header.decimal_comma else ".", quoting=csv.QUOTE_NONE,
+            dtype={i: "category" if i in words else float for i in range(header.width)},
+        )  # fmt: skip
+        if numbers is not None:
+            self._add_rows(numbers, range(skipped + 1, skipped + 1 + len(numbers)))
+        return numbers is not None
 
     def _parse_fast(self, block: bytes, large: int = 1_048_576) -> np.ndarray | None:
         """Return the rows, parsed by NumPy or above `large` bytes by pandas, or None if a line has another form."""
@@ -226,7 +277,8 @@ class _TableParser:
         if self._header.decimal_comma:
             block = block.replace(b",", b".")
         if len(block) > large:
-            return self._parse_large(block)
+            places = sorted(set(self._column_indices))
+            return self._parse_large(io.BytesIO(block), usecols=places, dtype=float, encoding="latin-1")
         try:
             return np.loadtxt(
                 io.BytesIO(block), delimiter=delimiter, ndmin=2, comments=None, usecols=self._column_indices,
@@ -235,19 +287,17 @@ class _TableParser:
         except ValueError:
             return None
 
-    def _parse_large(self, block: bytes) -> np.ndarray | None:
+    def _parse_large(self, text: str | io.BytesIO, **options: Any) -> np.ndarray | None:
         """Return the rows, parsed by pandas, which takes half a second to import and a fifth of NumPy's time to run."""
         import pandas
 
-        places = sorted(set(self._column_indices))
         try:
             frame = pandas.read_csv(
-                io.BytesIO(block), sep=self._header.delimiter, header=None, usecols=places, dtype=float,
-                na_filter=False, encoding="latin-1",
-            )  # fmt: skip
-        except ValueError:
+                text, sep=self._header.delimiter, header=None, na_filter=False, skip_blank_lines=False, **options
+            )
+            return frame[self._column_indices].to_numpy(dtype=float)
+        except (ValueError, KeyError):
             return None
-        return frame.to_numpy()[:, [places.index(place) for place in self._column_indices]]
 
     def _parse_line_by_line(self, block: bytes, first: int) -> tuple[np.ndarray, list[int]]:
         """Return the rows, parsed line by line to locate an invalid cell or to skip empty lines."""
@@ -258,6 +308,11 @@ class _TableParser:
             if not text.strip(delimiter + " ") or text.startswith("#"):
                 continue
             cells = split_cells(text, delimiter)
+            if SEGMENT.match(text) or text.strip() == self._header.first_line:
+                raise SegmentsError(
+                    f"{self._source}, line {line}: another segment begins ('{text[:60]}'); choose one, as"
+                    f" {SEGMENT_OPTION}"
+                )
             is_word = bool(cells[0]) and parse_number(cells[0], self._header.decimal_comma) is None
             if self._has_time and is_word and (rows or self._starts[-1]):
                 self._footer.append((line, cells[0]))
@@ -281,11 +336,6 @@ class _TableParser:
 
     def _refuse_words(self, line: int, words: str) -> NoReturn:
         """Raise InputError for a line of words among rows of numbers."""
-        if re.match(r"Step Information|Channels|\*\*\*End_of_Header", words):  # LTspice, LabVIEW
-            raise InputError(
-                f"{self._source}, line {line}: holds several runs or segments, the next from '{words[:60]}' on; keep"
-                " one of them in the file, or export one"
-            )
         raise InputError(
             f"{self._source}, line {line}, column 1: '{words[:40]}' is not a number; correct or remove the row"
         )
@@ -300,6 +350,9 @@ class _TableParser:
     def _line_label(self, row: int) -> str:
         part = bisect.bisect_right(self._starts, row) - 1
         return f"line {self._lines[part][row - self._starts[part]]}"
+
+    def count_segments(self) -> int:
+        return self._header.count_segments()
 
     def to_capture(self) -> Capture:
         """Return the columns that were read."""
@@ -334,7 +387,8 @@ class _TableParser:
         return capture
 
     def _take_columns(self) -> list[np.ndarray]:
-        columns = [np.concatenate([part[:, i] for part in self._parts]) for i in range(len(self._column_indices))]
+        whole = self._parts[0] if len(self._parts) == 1 else np.concatenate(self._parts or [np.empty((0, 1))])
+        columns = list(np.ascontiguousarray(whole.T))
         self._parts.clear()
         return columns
 
@@ -361,9 +415,9 @@ class _TableParser:
         """Return times of day in s since the first one, beyond midnights; refuse a clock that repeats its times."""
         if self._clock_start is None:
             self._clock_start = self._clock_end = float(time[0])
-        steps = np.diff(time, prepend=self._clock_end % _DAY)
-        steps = np.where(steps < -0.5 * _DAY, steps + _DAY, steps)
         with np.errstate(invalid="ignore"):  # times that are not finite are refused with their line
+            steps = np.diff(time, prepend=self._clock_end % _DAY)
+            steps = np.where(steps < -0.5 * _DAY, steps + _DAY, steps)
             since = self._clock_end - self._clock_start + np.cumsum(steps)
         self._clock_end = self._clock_start + float(since[-1])
         rate, second = self._header.rate, 1.0  # in which clocks are written at least
