@@ -35,9 +35,8 @@ def preview(path: str | os.PathLike[str], rate: float | None = None, segment: in
                 break
             is_timed = given is None
             count = len(capture.channels)
-            title = (
-                f"{capture.source} ({capture.format}) holds {capture.time.size:,} rows in {count} columns of values:"
-            )
+            place = capture.source if chosen == segment else f"segment {chosen} of {capture.source}"
+            title = f"{place} ({capture.format}) holds {capture.time.size:,} rows in {count} columns of values:"
             table = describe_rows(capture.channels, capture.time if is_timed else None)
             reason, command = guess_command(capture, None if is_timed else rate, is_timed, chosen)
             return "\n".join([title, *table, f"guess {reason}" + f":\n  {command}" * bool(command)])
@@ -86,7 +85,7 @@ def guess_command(
         for channel, column in channels.items()
         if column.unit_text and column.unit != CHANNEL_UNITS[channel]
     }
-    if not assigned and not scaled:
+    if not assigned and not scaled and (segment is None or not {"Vsc", "I"} & known.keys()):
         return "by units and sizes: no other column is a voltage or a current that varies; export Vsc or I", ""
     if rate is not None:
         options += ["--rate", f"{rate:.9g}Hz"]

@@ -120,6 +120,8 @@ UNASSIGNED = {
     "a count, no time": (table("n,a,b", COUNT, V, VSC), 2, BOTH),
     "arrays without time": (write_arrays, 2, BOTH),
     "rounded times": (table("time_s,a,b", TIME, V, VSC, digits="%.4f"), 2, BOTH),
+    "two segments": (table("t (s),a,b", np.tile(TIME, 2), np.tile(VSC, 2), np.tile(V, 2)), 2, BOTH),
+    "two segments with names": (table("time_s,V_V,Vsc_V", np.tile(TIME, 2), np.tile(V, 2), np.tile(VSC, 2)), 2, BOTH),
     "frequencies": (table("freq,A,B", FREQUENCY, V, VSC), 2, "guess by 'freq': a spectrum; name its columns"),
     "frequencies, no header": (table("", FREQUENCY, V, VSC, CURRENT), 2, "guess by 'column 1': a spectrum"),
     "a spectrum without units": (table("f_Hz,magnitude,phase", FREQUENCY, V, VSC), 2, "f_Hz,magnitude,phase"),
