@@ -89,7 +89,9 @@ def test_which_model_is_used(monkeypatch, of_planned: str, of_full: str, used: s
 def test_a_recorded_drive_is_planned_for_as_it_was_recorded():
     drive = {"waveform": "trapezoid", "rise_time": "0.5 ms", "peak_to_peak": "200 V", "frequency": "250 Hz"}
     body = {"grounding": {"R_H": "20 kohm"}}  # acts over 27 us, which samples at 1 us resolve
-    named = fitact.Scene.from_dict(body | {"drive": drive, "measurement": {"sampling_rate": "1 MHz"}})
+    # noise of V would be part of a recorded drive, and of its peaks
+    measured = {"sampling_rate": "1 MHz", "noise_V": "0 V"}
+    named = fitact.Scene.from_dict(body | {"drive": drive, "measurement": measured})
     record = simulate(named)
     stated = fitact.plan(named)
     (r_h, edges, _) = stated.omissions
