@@ -65,7 +65,6 @@ Segment = Annotated[
     str | None,
     typer.Option(
         "--segment",
-        "--spectrum",
         metavar="N",
         help="Number, from 1, of a run, step, frame or sheet in a file that holds several; of spectra also all.",
     ),
