@@ -83,6 +83,26 @@ def test_a_delay_that_nobody_stated_is_found_in_a_rounded_drive(bits: int, noise
         assert abs(delay["q50"] - 0.5 * STEP) < 3.5 * delay["sd"]
 
 
+def test_a_skew_too_small_to_be_fitted_is_in_the_uncertainty():
+    """An eighth of a step, and none: b is off by up to 8 u of the fit, which has no delay in most of these records."""
+    given = {"drive": {"waveform": "measured"}, "prior": {"Ci": {"relative_sd": 0.1}}}
+    scene = fitact.Scene.from_dict(given)
+    b, off, kept = SKIN[0] * (2.0 * SKIN[2] + SKIN[1]), [], []
+    for seed, skew in ((seed, skew) for skew in (0, 1) for seed in range(4)):
+        fit = fitact.fit(record(seed, skew, 0.1, bits=12), scene)
+        found = fit.derived()["b"]
+        off.append(np.log(found["q50"] / b) / found["combined"]["u"])
+        if "delay" not in fit.names:
+            kept.append(np.log(found["q50"] / b) / found["u"])
+            (delay,) = [each for each in fit.calibration_entry("b")["not_stated"] if each["source"] == "skew"]
+            assert 0.0 < delay["input_u"] < STEP
+    assert np.max(np.abs(kept)) > 5.0
+    assert np.max(np.abs(off)) < 3.0
+    stated = {"instrument": {"V": ["scope-8bit:S"], "Vsc": ["scope-8bit:S"]}}
+    instrument = fitact.fit(record(0, 1, 0.1), fitact.Scene.from_dict(given | stated))
+    assert all(each["source"] != "skew" for each in instrument.calibration_entry("b")["not_stated"])
+
+
 def test_the_table_and_the_full_sum_shift_alike():
     made = record(1, 11, 0.1)  # more than a step, by which the noise of V is moved, too
     compressed, full = fitact.fit(made, SCENE), fitact.fit(made, SCENE, tolerance=0.0)
