@@ -10,6 +10,7 @@ from jaxtyping import Float
 from fitact import summary
 from fitact.fitting.geometry import Contribution
 from fitact.fitting.least_squares import LeastSquaresResult
+from fitact.fitting.score_test import orthonormalise
 from fitact.instrument.classes import TYPICAL, USUAL_STRAY, typical_gains
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.skin import probe_parameters
@@ -102,9 +103,10 @@ def estimate_skews(
         rows, sigma, jacobian = solution.residuals[i].size, solution.sigma[i], solution.jacobian[i]
         # residuals beside linear nuisances, whose coefficients follow as rows of their prior
         added = np.pad(-solution.slope[i] / sigma, (0, len(jacobian) - rows))
-        shapes = channel.linear_sd[list(channel.columns), None] * solution.shapes[i] / sigma
-        nuisances = np.hstack([shapes, -np.eye(len(shapes))]).T
-        added = added - nuisances @ np.linalg.lstsq(nuisances, added)[0]
+        sd = channel.linear_sd[list(channel.columns)]
+        shapes = sd[:, None] * solution.shapes[i] / sigma
+        nuisances = orthonormalise(np.hstack([shapes, -np.eye(sd.size)])[sd > 0.0])
+        added = added - (nuisances @ added) @ nuisances
         products = jacobian.T @ added
         shift = -root @ (root.T @ products)
         information = added @ added + products @ shift + float(channel.timing.step) ** -2
