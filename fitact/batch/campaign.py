@@ -54,7 +54,7 @@ class Task:
     """Input of a worker in addition to the records."""
 
     scene: str | None  # scene as JSON; None means the device of the reference paper
-    columns: dict[str, Any]  # `channels`, `scale` and `rate` of files, as in `fitact.read`
+    columns: dict[str, Any]  # `channels`, `scale`, `rate` and `segment` of files, as in `fitact.read`
     reports: str | None  # folder for a posterior and a report of each record, or None
     seed: int  # seed of the sampling
     posteriors: bool = False  # whether rows are made by `sample_many` instead of `fit_many`
@@ -180,9 +180,7 @@ def run_campaign(
         if count > 1:
             raise InputError(f"{path}: is given twice; give each record once")
     out = Path(folder)
-    columns = {"channels": dict(channels or {}), "scale": dict(scale or {}), "rate": rate} | (
-        {} if segment is None else {"segment": segment}
-    )
+    columns = {"channels": dict(channels or {}), "scale": dict(scale or {}), "rate": rate, "segment": segment}
     stated = None if scene is None else scene.to_json()
     task = Task(stated, columns, str(out / "reports") if reports else None, seed, posteriors)
     try:

@@ -118,9 +118,13 @@ class Record(Display):
 
     def noise(self, channel: str) -> float:
         """Return a model-free estimate of the channel's noise sd: white noise and rounding."""
+        return math.hypot(*self.noise_parts(channel))
+
+    def noise_parts(self, channel: str) -> tuple[float, float]:
+        """Return the sd of white noise, and that of rounding (see `noise`)."""
         if ("noise", channel) not in self._estimates:
             values = self[channel] if channel == "V" else self[channel][~clipping_mask(self[channel])]
-            self._estimates["noise", channel] = math.hypot(white_noise_sd(values), rounding_noise_sd(values))
+            self._estimates["noise", channel] = white_noise_sd(values), rounding_noise_sd(values)
         return self._estimates["noise", channel]
 
     @property

@@ -88,7 +88,7 @@ class Fit(Display):
     noise_information: dict[str, Float[np.ndarray, "rows parameters"]]
     gain_shifts: dict[str, Float[np.ndarray, " parameters"]]
     stray_changes: dict[str, float]
-    skews: tuple[Skew, ...] = ()
+    skews: tuple[Skew, ...]
     misfit_effects: EffectSizes | None = None
     kramers_kronig: KramersKronig | None = None
 

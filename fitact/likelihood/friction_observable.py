@@ -61,20 +61,16 @@ class FrictionObservable(Observable):
         self, samples: PaddedSamples, inputs: ChannelInputs, extra_delay: ArrayLike = 0.0
     ) -> Float[Array, " samples"]:
         """Return the reading of the sensor for the square of the voltage that generates the force, V^2."""
-        first = samples.time if samples.phases is None else samples.phases
-        acting, alone = dataclasses.replace(samples, time=first, phases=None), dataclasses.replace(inputs, gain=1.0)
+        first, alone = samples.first_period(), dataclasses.replace(inputs, gain=1.0)
         sensor, step = self._sensor(inputs), self.timing.step
 
         def voltage(delay: ArrayLike) -> Array:
-            return self.voltage.response(acting, alone, extra_delay + delay)
-
-        def repeat(square: Array) -> Array:
-            return square if samples.phases is None else square[jnp.arange(samples.time.size) % samples.period]
+            return self.voltage.response(first, alone, extra_delay + delay)
 
         if sensor is None:
-            return repeat(jnp.square(voltage(0.0)))
+            return samples.repeat(jnp.square(voltage(0.0)))
         squares = square_over_steps(voltage, step, follows_samples=self.follows_samples)
-        return sensor.respond(StepForce(*map(repeat, squares)), step)
+        return sensor.respond(StepForce(*map(samples.repeat, squares)), step)
 
     def response(
         self, samples: PaddedSamples, inputs: ChannelInputs, extra_delay: ArrayLike = 0.0

@@ -134,8 +134,7 @@ class ElectricalSignal(Observable):
         self, samples: PaddedSamples, inputs: ChannelInputs, extra_delay: ArrayLike = 0.0
     ) -> Float[Array, " samples"]:
         if samples.phases is not None and "clock" not in self.timing.free:
-            folded = dataclasses.replace(samples, time=samples.phases, phases=None)
-            return self.response(folded, inputs, extra_delay)[jnp.arange(samples.time.size) % samples.period]
+            return samples.repeat(self.response(samples.first_period(), inputs, extra_delay))
         charges = samples.charges
         undelayed = charges is not None or (
             not self.timing.free and isinstance(extra_delay, float) and extra_delay == 0.0

@@ -68,6 +68,14 @@ class PaddedSamples(eqx.Module):
         """Middle of the record, and half its length, s."""
         return 0.5 * (self.time[0] + self.time[-1]), 0.5 * (self.time[-1] - self.time[0])
 
+    def first_period(self) -> "PaddedSamples":
+        """Return the samples at the `phases`, or all if there are none."""
+        return self if self.phases is None else dataclasses.replace(self, time=self.phases, phases=None)
+
+    def repeat(self, values: Float[Array, " phases"]) -> Float[Array, " samples"]:
+        """Return values at the `first_period` at all samples."""
+        return values if self.phases is None else values[jnp.arange(self.time.size) % self.period]
+
     def apply_whitening(self, values: Float[Array, "*shape samples"]) -> Float[Array, "*shape samples"]:
         """Return values over the samples in units of independent noise of equal sd; 0 for excluded samples."""
         values = values if self.weight is None else values * self.weight

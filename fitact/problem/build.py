@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from fitact.compiled import MAX_PADDED_LENGTH, as_arrays, pad_samples, pad_weight
 from fitact.data.clipping import clipping_mask, describe_clipping
-from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
+from fitact.data.record import Record, rounding_noise_sd
 from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
 from fitact.experiment.blind_directions import STRAY, gain_names
@@ -313,7 +313,7 @@ def _estimate_channel(
 ) -> _ChannelStart:
     """Estimate the circuit from a channel, unless its estimate comes with rows of charge."""
     template = bare.template
-    edge_sd = 0.0 if choice.name != "measured" or channel == "Ft" else rounded_gain_sd(record["V"])
+    edge_sd = 0.0 if choice.name != "measured" or channel == "Ft" else rounded_gain_sd(record)
     if channel == "Vsc" and (not limits_current(template) or taus[-1] < record.time_step):  # Vsc jumps with V
         plain = constant_skin_circuit(template)
         highest = (0.5 if isinstance(plain, FinalCircuit) else 1.0) * largest_gain(scene)
@@ -377,7 +377,7 @@ def _can_smooth(choice: DriveModel, template: Circuit) -> bool:
 
 def _smooth_drive(record: Record) -> Float[np.ndarray, " samples"] | None:
     """Return V as a delay shifts it; None if it has no noise, or less than half of its rounding's beside it."""
-    noise, rounding = white_noise_sd(record["V"]), rounding_noise_sd(record["V"])
+    noise, rounding = record.noise_parts("V")
     if noise == 0.0 or math.hypot(rounding, 0.5 * rounding) > noise:
         return None
     return pad_samples(smooth_drive(record["V"], noise))
@@ -385,7 +385,10 @@ def _smooth_drive(record: Record) -> Float[np.ndarray, " samples"] | None:
 
 def _require_whole_drive(record: Record, choice: DriveModel) -> None:
     """Refuse a clipped measured drive; flat tops without noise are not regarded as clipping."""
-    if choice.name != "measured" or white_noise_sd(record["V"]) == 0.0 or rounding_noise_sd(record["V"]) > 0.0:
+    if choice.name != "measured":
+        return
+    white, rounding = record.noise_parts("V")
+    if white == 0.0 or rounding > 0.0:
         return
     count = np.count_nonzero(clipping_mask(record["V"]))
     if count:
@@ -466,13 +469,14 @@ def _unresolved_gain_sd(record: Record, choice: DriveModel, start: VscEstimate) 
     return edge_gain_sd(record.time_step, start.b)
 
 
-def rounded_gain_sd(voltage: np.ndarray, min_part: float = 0.1, least: float = 2e-4) -> float:
-    """Return the sd of log(gain) that stands for the rounding of flat levels, which their samples share.
+def rounded_gain_sd(record: Record, min_part: float = 0.1, least: float = 2e-4) -> float:
+    """Return the sd of log(gain) that stands for the rounding of flat levels of V, which their samples share.
 
     It is 0 if less than `min_part` of the samples have the same value as those around them, and below `least`, which
     is that of 11 bits.
     """
-    sd = math.sqrt(2.0) * rounding_noise_sd(voltage) / float(np.ptp(voltage))
+    voltage, (_, rounding) = record["V"], record.noise_parts("V")
+    sd = math.sqrt(2.0) * rounding / float(np.ptp(voltage))
     return sd if sd > least and long_run_share(voltage) > min_part else 0.0
 
 

@@ -126,9 +126,9 @@ def read_spectra(path: str | os.PathLike[str], shunt: float | None = None) -> tu
     Raises:
         InputError: the file cannot be read, or holds no spectrum; the message names the line and a remedy.
     """
-    source, lines = os.fspath(path), _split_lines(_read_text(path, 2**26))  # bytes, more than any spectrum has
-    spectra: list[Spectrum] = []
-    plots = read_ac_analyses(Path(path)) if is_ac_analysis(Path(path)) else find_ac_analyses(lines)
+    source, is_raw, spectra = os.fspath(path), is_ac_analysis(Path(path)), list[Spectrum]()
+    lines = [] if is_raw else _split_lines(_read_text(path, 2**26))  # bytes, more than any spectrum has
+    plots = read_ac_analyses(Path(path)) if is_raw else find_ac_analyses(lines)
     for rows, channel, note in (find_response(plot, source) for plot in plots):
         layout = _Layout(channel, (0, 1, 2), lambda x: (x[:, 0], x[:, 1] + 1j * x[:, 2]), note=note)
         spectra += _to_spectra(layout, rows, source, shunt)

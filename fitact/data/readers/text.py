@@ -57,12 +57,13 @@ def read_text(
     try:
         with _open_text(path, max_bytes) as (stream, file):
             parts = find_parts(path, stream, segment, max_bytes)
+            place = select_segment(segment, len(parts), source) if len(parts) > 1 else 0
             if parts:
-                stream = io.BytesIO(parts[select_segment(segment, len(parts), source) if len(parts) > 1 else 0][0])
+                stream = io.BytesIO(parts[place][0])
             head = stream.read(_HEAD_BYTES)
             stream.seek(0)
             table = _TableParser.from_head(head.rstrip(PADDING), source, pick, read_sidecar(path), rate)
-            table.line_shift = parts[(segment or 1) - 1][1] if len(parts) > 1 else 0
+            table.line_shift = parts[place][1] if parts else 0
             if stream is not file or not table.add_file(path):
                 blocks = _blocks(iter(lambda: stream.read(BLOCK_BYTES), b""), source, max_bytes)
                 for block in track_progress(blocks, f"reading {source}", path.stat().st_size, file.tell):
