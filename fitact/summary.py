@@ -98,12 +98,12 @@ def combine(summary: Summary) -> Summary:
 
 
 # sources in `combined` that nobody stated, beside defaults
-UNSTATED_GAINS, UNSTATED_STRAY, UNSTATED_SKEW = "unstated gains", "unstated stray C", "unstated skew"
+UNSTATED_GAINS, UNSTATED_STRAY = "unstated gains", "unstated stray C"
 
 
 def is_default(source: str) -> bool:
     """Return whether a source in `combined` is a value that nobody stated."""
-    return source.startswith(("default", "spread of", UNSTATED_GAINS, UNSTATED_STRAY, UNSTATED_SKEW))
+    return source.startswith(("default", "spread of", UNSTATED_GAINS, UNSTATED_STRAY))
 
 
 def rounding_unit(summary: Summary) -> float:

@@ -27,7 +27,7 @@ from fitact.batch.recorded_tables import (
 from fitact.compiled import jit, map_blocks
 from fitact.data.record import Record, rounding_noise_sd
 from fitact.fitting.derived import DerivedQuantities
-from fitact.fitting.least_squares import MIN_BIC_DECREASE, NUISANCES, bic_decrease_from_z
+from fitact.fitting.least_squares import MIN_BIC_DECREASE, NUISANCES
 from fitact.fitting.residual_statistics import interpolation_errors, is_misfit, residual_statistics
 from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics, sum_rows
 from fitact.fitting.result import Fit
@@ -80,19 +80,21 @@ class RecordedDriveProblem(BatchProblem):
     def from_fit(cls, fitted: Fit, problem: Problem, count: int) -> Self | None:
         """Make the problem for `count` records like that of a fit to `problem`, or None if batches cannot fit them.
 
-        A delay is fitted in all records if it was fitted in this one.
+        They have the timing of this one; a delay that nobody expected is for separate fits.
         """
         likelihood, record, choice = fitted.likelihood, fitted.record, fitted.choice
         (trace, *others), time, tau = likelihood.channels, record.time, likelihood.evaluate_circuit(fitted.theta).tau
         if others or not fitted.trusted or choice.name != "measured" or choice.steady_state:
             return None
         is_plain = trace.channel == "Vsc" and trace.noise == "white" and trace.timing.free in ((), ("delay",))
+        is_plain &= trace.timing.free == problem.likelihood.channels[0].timing.free
         has_other_model = isinstance(likelihood.template, WithSkin) or len(tau) > 1
         has_other_model |= passes_direct_current(likelihood.template)
         if has_other_model or not is_plain or time.size > cls.settings.max_samples or not is_exactly_uniform(time):
             return None
         delay = float(likelihood.to_physical(fitted.theta).get("delay", 0.0))
-        origin, margin = round(delay / float(trace.timing.step)), MAX_DELAY if trace.timing.free else 0
+        origin = round(float(trace.timing.shift / trace.timing.step))
+        margin = MAX_DELAY if trace.timing.free else 0
         shared = SharedFunctions.from_times(time, margin, float(tau[0]), origin)
         counted = np.flatnonzero(trace.samples.weights[: time.size] == 1.0)
         if abs(origin) > MAX_DELAY - AGES or not np.array_equal(counted, np.arange(margin, time.size - margin)):
@@ -134,8 +136,10 @@ class RecordedDriveProblem(BatchProblem):
         """Fit `unit` records, and optionally test the residuals for structure (`whiteness`), in double precision."""
         V, Vsc = stack_channel(records, "V"), stack_channel(records, "Vsc")
         driven, screened = Screening.from_values(V, self.settings), Screening.from_values(Vsc, self.settings)
-        white = np.where(driven.fine, driven.noise, 0.0)
-        tables = Tables.from_records(self.shared, V, Vsc, white)
+        # the ADC's steps, which take long to find, are looked for only where they may exceed the noise
+        rounding = np.array([0.0 if fine else rounding_noise_sd(v) for v, fine in zip(V, driven.fine, strict=True)])
+        noise_V = np.hypot(driven.noise, rounding)
+        tables = Tables.from_records(self.shared, V, Vsc, noise_V)
         gain_sd = None
         if "gain" in self.names:
             edges = edge_gain_sd(float(self.shared.time_step), tables.b) if self.unresolved else np.zeros(len(V))
@@ -146,15 +150,15 @@ class RecordedDriveProblem(BatchProblem):
         weight = self.derive.weight[: self.evaluated.stop - self.evaluated.start]
         contact = weight, self.derive.coefficient, self.derive.normal_force
         square, tests, logs, gradients = _evaluate_records(
-            self.shared, self.phases, self.evaluated.start, contact, whiteness, tables.b, optimum, V, Vsc, white
+            self.shared, self.phases, self.evaluated.start, contact, whiteness, tables.b, optimum, V, Vsc, noise_V
         )
-        figures = self._figures(V, driven, screened, square, tests, inputs.linear_sd, optimum.gain)
+        expected = np.hypot(screened.noise, optimum.gain * noise_V)
+        figures = self._figures(V, driven.noise, expected, square, tests, inputs.linear_sd, optimum.gain)
         factor = np.linalg.inv(optima.r_factor)
         loss = np.abs(optima.sum_of_squares - square)
         accepted = tables.is_possible & screened.fine & ~screened.railed & self._is_whole_drive(V, driven)
         accepted &= optima.converged & (loss <= self.settings.max_rounding_loss * square) & ~is_misfit(figures)
         accepted &= np.max(self.bic_decreases(optima.r_squared), axis=1) <= MIN_BIC_DECREASE
-        accepted &= self._needs_delay(optima.theta, factor)
         freed = np.array([self._nuisance_names(free) for free in inputs.linear_sd > 0.0])
         prior = np.array(np.broadcast_to(self.prior_factor, factor.shape))
         if gain_sd is not None:
@@ -171,20 +175,20 @@ class RecordedDriveProblem(BatchProblem):
     def _figures(
         self,
         V: Float[np.ndarray, "records samples"],
-        driven: Screening,
-        screened: Screening,
+        white_V: Float[np.ndarray, " records"],
+        expected: Float[np.ndarray, " records"],
         square: Float[np.ndarray, " records"],
         tests: ResidualTestStatistics | None,
         linear_sd: Float[np.ndarray, "records nuisances"],
         gain: Float[np.ndarray, " records"],
     ) -> dict[str, np.ndarray]:
-        """Return the figures of merit; compare `fitact.fitting.residual_statistics.channel_statistics`."""
-        # the ADC's steps, which take long to find, are looked for only where they may exceed the noise
-        rounding = np.array([0.0 if fine else rounding_noise_sd(v) for v, fine in zip(V, driven.fine, strict=True)])
-        expected = np.hypot(screened.noise, gain * np.hypot(driven.noise, rounding))
+        """Return the figures of merit, for white noise of V and the `expected` noise of the residuals.
+
+        Compare `fitact.fitting.residual_statistics.channel_statistics`.
+        """
         freedom = self.samples - len(self.names) - np.count_nonzero(linear_sd, axis=1)
         figures = residual_statistics(square, self.samples, tests, expected, freedom, self.phases)
-        interpolation = gain * interpolation_errors(V, driven.noise)
+        interpolation = gain * interpolation_errors(V, white_V)
         return figures | {"rounding_noise": np.zeros(len(V)), "interpolation_error": interpolation}
 
     def _is_whole_drive(
@@ -229,18 +233,6 @@ class RecordedDriveProblem(BatchProblem):
     def _select(self, fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return the fields of compressions, without steps if no delay is fitted."""
         return fields if self.likelihood.channels[0].timing.free else fields | {"steps": fields["steps"][:, :0]}
-
-    def _needs_delay(
-        self, theta: Float[np.ndarray, "records parameters"], factor: Float[np.ndarray, "records n n"]
-    ) -> Bool[np.ndarray, " records"]:
-        """Return whether a free delay is clearly significant by the BIC, or none is free."""
-        channel = self.likelihood.channels[0]
-        if not channel.timing.free:
-            return np.ones(len(theta), bool)
-        place = self.names.index("delay")
-        delay = float(channel.timing.shift) / float(channel.timing.step) + theta[:, place]
-        z_squared = np.square(delay) / np.sum(np.square(factor[:, place]), axis=1)
-        return bic_decrease_from_z(z_squared, self.samples) > 2.0 * MIN_BIC_DECREASE
 
     def _nuisance_names(self, is_free: Bool[np.ndarray, " nuisances"]) -> str:
         """Return the names of the nuisances that were fitted, as in `Fit.model`."""

@@ -102,14 +102,13 @@ class SharedFunctions(NamedTuple):
         tau: Float[Array, " nodes"],
         noise: ArrayLike = 0.0,
     ) -> Float[Array, "own samples"]:
-        """Return the functions of a record: the responses to V at the nodes, the steps of V, and last Vsc itself.
+        """Return the functions of a record: the responses to V at the nodes, the `steps`, and last Vsc itself.
 
-        They are those at the times of the drive, i.e. without the delay `origin`. The steps are those of V without its
-        white `noise` (sd in V).
+        They are those at the times of the drive, i.e. without the delay `origin`. `noise` is the sd of that of V.
         """
-        x, samples = self.time_step / tau, V.size
-        rises = jnp.diff(jnp.pad(smooth_drive(V, noise), (AGES + 1, AGES), mode="edge"))
-        steps = [rises[AGES - age : AGES - age + samples] for age in range(-AGES, AGES)]
+        x, samples, smooth = self.time_step / tau, V.size, smooth_drive(V, noise)
+        rises = jnp.diff(jnp.pad(smooth, (AGES + 1, AGES), mode="edge")) / self.time_step
+        steps = [*(rises[AGES - age : AGES - age + samples] for age in range(-AGES, AGES)), V - smooth]
         # the first sample is a jump from 0
         rise = jnp.pad(jnp.diff(V, prepend=V[:1]), (0, -samples % _BLOCK))
         u = uniform_recurrence(rise, V[0] * jnp.exp(x), x, _BLOCK)[:, :samples]
@@ -168,8 +167,8 @@ class Tables(NamedTuple):
             columns = np.broadcast_to(np.eye(count - 1, count), (len(columns), count - 1, count))
         records, rows, _ = columns.shape
         size, series = self.shared.size, chebyshev(TABLE_NODES)[1].T
-        found = split_functions(columns, {"shared": size, "signal": TABLE_NODES, "steps": 2 * AGES, "observed": 1})
-        steps = np.swapaxes(found["steps"], 1, 2) / self.shared.time_step
+        found = split_functions(columns, {"shared": size, "signal": TABLE_NODES, "steps": 2 * AGES + 1, "observed": 1})
+        steps = np.swapaxes(found["steps"], 1, 2)
         zeros, missing = np.zeros((records, rows)), ((0, 0), (0, rows - size))
         return {
             "center": np.log(self.b),
@@ -181,6 +180,7 @@ class Tables(NamedTuple):
             "observed": found["observed"][..., 0],
             "observed_slope": zeros,
             "steps": steps,
+            "noise_gain": self.g,
         }
 
 

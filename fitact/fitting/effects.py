@@ -113,19 +113,26 @@ def _channel_samples(
 def _free_timing(laplace: Laplace, channel: ChannelLikelihood, shift: float) -> dict[str, Timing]:
     """Return the free delay and clock of a channel; `shift` (s) is that of the drive before the fit."""
     likelihood, timing = laplace.likelihood, {}
-    values = likelihood.to_physical(laplace.theta)
+    values, sd = likelihood.to_physical(laplace.theta), dict(zip(likelihood.timing, likelihood.timing_sd, strict=True))
     for name in channel.timing.free:
         key = channel.qualified_name(name)
         total = float(values[key]) - (shift if name == "delay" else 0.0)
-        timing[name] = Timing(likelihood.names.index(key), likelihood.timing[key][1], total)
+        unit = likelihood.timing[key][1]
+        is_skew = name == "delay" and channel.observable.follows_samples
+        is_expected = is_skew and abs(total) <= 3.0 * float(sd[key]) * unit
+        timing[name] = Timing(likelihood.names.index(key), unit, total, is_expected)
     return timing
 
 
 def _added_nuisances(samples: ChannelSamples) -> list[str]:
-    """Return the nuisances of a channel that the data asked for; every channel has an offset, which tells nothing."""
+    """Return the nuisances of a channel that the data asked for.
+
+    Every channel has an offset, and a skew that its prior expects, which tell nothing.
+    """
     added = {name.removesuffix("_cos").removesuffix("_sin") for name in samples.nuisances}
     linear = [group for group in NUISANCES if group in added and group != "offset"]
-    return linear + [name for name in TIMING_NUISANCES if name in samples.timing]
+    timing = samples.timing
+    return linear + [name for name in TIMING_NUISANCES if name in timing and not timing[name].is_expected]
 
 
 def is_tolerable(effects: EffectSizes, laplace: Laplace, force: float, others: float = 0.05) -> bool:

@@ -10,13 +10,11 @@ from jaxtyping import Float
 from fitact import summary
 from fitact.fitting.geometry import Contribution
 from fitact.fitting.least_squares import LeastSquaresResult
-from fitact.fitting.score_test import orthonormalise
 from fitact.instrument.classes import TYPICAL, USUAL_STRAY, typical_gains
 from fitact.likelihood.likelihood import Likelihood
 from fitact.model.skin import probe_parameters
 from fitact.prior.distributions import LogNormal, Uniform
 from fitact.problem.instrument_errors import UNRESOLVED_V, ErrorCoordinate, InstrumentError
-from fitact.problem.source import Source
 from fitact.scene.assumptions import states_Ci
 from fitact.scene.scene import Scene
 from fitact.uncertainty.budget import Component, ErrorSource
@@ -81,40 +79,6 @@ def structure_components(effects: EffectSizes, quantity: str) -> tuple[Component
     return tuple(Component(name, "B", u, 1.0, *known) for name, u in found if u > 0.0)
 
 
-class Skew(NamedTuple):
-    """A skew between V and Vsc that nobody stated, and that a fit leaves out."""
-
-    sd: float  # root of its mean square by the record, s
-    shift: Float[np.ndarray, " parameters"]  # change of theta for a skew of 1 s
-
-
-def estimate_skews(
-    solution: LeastSquaresResult, root: Float[np.ndarray, "parameters parameters"], sources: Sequence[Source]
-) -> tuple[Skew, ...]:
-    """Return what a free delay of each Vsc with a recorded V would change, to first order.
-
-    Its prior has an sd of a time step, as that of a current. The fit leaves a delay out that the BIC does not favour.
-    """
-    skews = []
-    for i, (channel, source) in enumerate(zip(solution.likelihood.channels, sources, strict=True)):
-        stated = source.scene.instrument.pieces("V") or source.scene.instrument.pieces("Vsc")
-        if channel.channel != "Vsc" or not channel.observable.follows_samples or channel.timing.free or stated:
-            continue
-        rows, sigma, jacobian = solution.residuals[i].size, solution.sigma[i], solution.jacobian[i]
-        # residuals beside linear nuisances, whose coefficients follow as rows of their prior
-        added = np.pad(-solution.slope[i] / sigma, (0, len(jacobian) - rows))
-        sd = channel.linear_sd[list(channel.columns)]
-        shapes = sd[:, None] * solution.shapes[i] / sigma
-        nuisances = orthonormalise(np.hstack([shapes, -np.eye(sd.size)])[sd > 0.0])
-        added = added - (nuisances @ added) @ nuisances
-        products = jacobian.T @ added
-        shift = -root @ (root.T @ products)
-        information = added @ added + products @ shift + float(channel.timing.step) ** -2
-        best = solution.slope[i] @ solution.residuals[i] / sigma**2 / information
-        skews.append(Skew(math.sqrt(best**2 + 1.0 / information), shift))
-    return tuple(skews)
-
-
 class UnstatedError(NamedTuple):
     """A usual error that nobody stated, with its components of the uncertainty of a quantity."""
 
@@ -128,14 +92,11 @@ class UnstatedError(NamedTuple):
         return {"source": self.source, "typical": self.typical, "input_u": input_u, "u": u}
 
 
-def list_unstated_errors(
-    gains: Mapping[str, float], stray: float, skews: Sequence[tuple[float, float]]
-) -> tuple[UnstatedError, ...]:
+def list_unstated_errors(gains: Mapping[str, float], stray: float) -> tuple[UnstatedError, ...]:
     """Return the usual errors that nobody stated, of a quantity.
 
     `gains`: its sensitivity to the gain of each channel, by channel. `stray`: its relative change by a stray
-    capacitance of `USUAL_STRAY`, which any value from 0 to there is taken to be as likely as. `skews`: the sd of
-    skews (s), and its sensitivity to them.
+    capacitance of `USUAL_STRAY`, which any value from 0 to there is taken to be as likely as.
     """
     errors = []
     known = "", False, True  # no advice, beyond the posterior, and the same in all records of a session
@@ -152,13 +113,6 @@ def list_unstated_errors(
         source = f"stray capacitance, not stated ({typical})"
         component = Component(source, "B", 3.0**-0.5, stray, None, *known, summary.UNSTATED_STRAY)
         errors.append(UnstatedError("stray capacitance", typical, (component,)))
-    for sd, sensitivity in skews:
-        typical = format_engineering(sd, "s", 2)
-        component = Component(
-            f"skew of Vsc against V, not stated ({typical} by the record)", "B", sd, sensitivity, None, *known,
-            summary.UNSTATED_SKEW,
-        )  # fmt: skip
-        errors.append(UnstatedError("skew", f"{typical} by the record", (component,)))
     return tuple(errors)
 
 

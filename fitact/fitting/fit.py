@@ -18,7 +18,6 @@ from fitact.fitting.calibrate import CalibratedInstruments, calibrate
 from fitact.fitting.channel_fit import ChannelFit, information_criteria
 from fitact.fitting.effects import assess_fit, is_tolerable
 from fitact.fitting.error_sources import (
-    estimate_skews,
     gain_shifts,
     list_error_sources,
     noise_information,
@@ -181,7 +180,6 @@ def _assemble_fit(
         noise_information=noise_information(likelihood, solution),
         gain_shifts=gain_shifts(likelihood, solution, root),
         stray_changes=stray or {},
-        skews=estimate_skews(solution, root, problem.sources),
         misfit_effects=effects,
         kramers_kronig=max(tests, key=lambda test: (not test.passed, test.worst_residual), default=None),
     )

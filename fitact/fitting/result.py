@@ -18,7 +18,6 @@ from fitact.fitting import derived
 from fitact.fitting.channel_fit import ChannelFit
 from fitact.fitting.effects import assess_fit, describe_alternatives, describe_structure
 from fitact.fitting.error_sources import (
-    Skew,
     UnstatedError,
     geometry_component,
     list_unstated_errors,
@@ -70,7 +69,6 @@ class Fit(Display):
         noise_information: root of the Fisher information of each source of noise.
         gain_shifts: change of theta for a relative error of 1 in the gain of V, Vsc or I that nobody stated.
         stray_changes: relative changes of Rsc, Csc and Ci by a usual stray capacitance that nobody stated.
-        skews: delays of Vsc against a recorded V that nobody stated, and that are not fitted.
         misfit_effects: effects of what the model lacks, where the verdict needed them.
         kramers_kronig: the worst of the tests of the spectra; None without spectra.
     """
@@ -88,7 +86,6 @@ class Fit(Display):
     noise_information: dict[str, Float[np.ndarray, "rows parameters"]]
     gain_shifts: dict[str, Float[np.ndarray, " parameters"]]
     stray_changes: dict[str, float]
-    skews: tuple[Skew, ...]
     misfit_effects: EffectSizes | None = None
     kramers_kronig: KramersKronig | None = None
 
@@ -292,10 +289,7 @@ class Fit(Display):
             gains[channel] = float(gradient @ shift) + direct
         changes = dict(zip(self.names, gradient, strict=True))
         stray = sum(math.log1p(size) * changes.get(other, 0.0) for other, size in self.stray_changes.items())
-        # below a third of the standard uncertainty, a skew adds less than a twentieth to it
-        u = float(np.linalg.norm(gradient @ self.covariance_root))
-        pairs = ((skew.sd, float(gradient @ skew.shift)) for skew in self.skews)
-        return list_unstated_errors(gains, stray, [pair for pair in pairs if abs(math.prod(pair)) > u / 3.0])
+        return list_unstated_errors(gains, stray)
 
     def calibration_entry(self, name: str) -> dict[str, Any]:
         """Return `stated` and `not_stated` of the budget of a quantity: usual errors that nobody stated."""

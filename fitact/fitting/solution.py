@@ -8,6 +8,7 @@ from fitact.fitting.instrument_effects import effects_would_change, fill_effects
 from fitact.fitting.least_squares import LeastSquaresResult, solve
 from fitact.fitting.multistart import choose_start
 from fitact.fitting.row_updates import update_rows
+from fitact.fitting.timing import shift_whole_steps, start_delays
 from fitact.likelihood import certificate
 from fitact.problem.build import Problem
 from fitact.problem.spectra import update_weights
@@ -24,10 +25,10 @@ def solve_problem(
 ) -> tuple[LeastSquaresResult, certificate.CertifiedLikelihood, np.ndarray]:
     """Fit, and fit again while effects of instruments for the new optimum would differ by more than `max_change`.
 
-    Also while weights of spectra change by more than a thousandth, or a current with a recorded drive by more than
-    `max_skew` time steps, or the parameters with the estimate of its drive by more than `max_change` standard errors.
-    It does not go on after `max_steps` of the search, of which a model that is wrong may need many. A current with a
-    recorded drive that has not settled ends with its most probable fit.
+    Also after the noise of V was moved with Vsc, while weights of spectra change by more than a thousandth, or a
+    current with a recorded drive by more than `max_skew` time steps, or the parameters with the estimate of its drive
+    by more than `max_change` standard errors. It does not go on after `max_steps` of the search, of which a model that
+    is wrong may need many. A current with a recorded drive that has not settled ends with its most probable fit.
     A delay that is known to a tenth of a step may change without end, by up to half a step, if the other parameters
     follow it by less than a twentieth of a standard error.
     """
@@ -39,6 +40,7 @@ def solve_problem(
         checked = not has_rows or round_number > 0
         problem = problem._replace(likelihood=likelihood)
         likelihood, reasons = problem.compress_likelihood(tolerance)  # what does not change stays compressed
+        likelihood = start_delays(likelihood, theta) if round_number == 0 else likelihood
         end = _solve_with_effects(problem._replace(likelihood=likelihood), reasons, tolerance, theta, checked)
         places = [end[0].likelihood.names.index(name) for name in likelihood.names]
         theta, steps = end[0].theta[places], steps + end[0].steps
@@ -49,6 +51,8 @@ def solve_problem(
             influences = [jacobian @ end[2] for jacobian in end[0].jacobian]
             likelihood, change = update_weights(likelihood, theta, problem.sources, influences)
             is_settled = change <= 1e-3
+        moved_likelihood, theta = shift_whole_steps(likelihood, theta, np.linalg.norm(end[2][places], axis=1))
+        is_settled, likelihood = is_settled and moved_likelihood is likelihood, moved_likelihood
         if has_rows:
             moved = np.abs(theta - before) / np.linalg.norm(end[2][places], axis=1)
             skew = np.max(np.abs(theta), where=likelihood.follows_rows, initial=0.0)

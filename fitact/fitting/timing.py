@@ -12,12 +12,13 @@ from fitact.compiled import jit, pad_rows
 from fitact.fitting.score_test import explained_squares, orthonormalise
 from fitact.likelihood.certificate import recompress
 from fitact.likelihood.channel import ChannelLikelihood
-from fitact.likelihood.likelihood import CircuitValues
+from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import student_weight
 from fitact.likelihood.observable import TIMING_NUISANCES, ChannelInputs
+from fitact.model.drive import Sampled
 from fitact.model.response import highpass
 from fitact.model.skin import constant_skin_circuit
-from fitact.problem.drive_choice import has_ideal_edges, ideal_edge_mask
+from fitact.problem.drive_choice import has_ideal_edges, has_unresolved_edge, ideal_edge_mask
 
 
 def free_timing(
@@ -61,12 +62,50 @@ def free_timing(
     shift, clock = timing.shift + change["delay"], timing.clock + change["clock"]
     channel = channel.replace_timing(shift=shift, clock=clock)
     if (steps := round(float(shift) / float(timing.step))) and channel.electrical.smooth is not None:
-        delayed = channel.electrical.delay_noise(steps, float(np.max(circuit.tau)))
+        delayed = channel.electrical.delay_noise(steps)
         channel = recompress(dataclasses.replace(channel, observable=delayed), circuit)
     if not edges.any():
         return channel
     timing_sd = np.hypot(good.std(axis=0), step / np.sqrt(12.0))
     return channel.exclude_samples(edges).replace_timing(sd=timing_sd)
+
+
+def start_delays(likelihood: Likelihood, theta: Float[np.ndarray, " parameters"]) -> Likelihood:
+    """Return the likelihood in which delays of recorded drives that jump between two samples start from a grid.
+
+    Each sample that such a jump passes is a minimum.
+    """
+    for i, channel in enumerate(likelihood.channels):
+        if "delay" not in channel.timing.free or not channel.observable.follows_samples:
+            continue
+        drive = channel.electrical.drive
+        assert isinstance(drive, Sampled)
+        if channel.samples.charges is None and has_unresolved_edge(np.asarray(drive.samples)):
+            at_theta = likelihood.channel_inputs(theta, i), likelihood.evaluate_circuit(theta)
+            likelihood = likelihood.replace_channel(i, free_timing(channel, *at_theta, "delay"))
+    return likelihood
+
+
+def shift_whole_steps(
+    likelihood: Likelihood, theta: Float[np.ndarray, " parameters"], sd: Float[np.ndarray, " parameters"]
+) -> tuple[Likelihood, Float[np.ndarray, " parameters"]]:
+    """Shift each Vsc that is clearly late by whole steps, with the noise of its recorded V.
+
+    `sd` is that of theta. The likelihood is the same if there are none.
+    """
+    theta = theta.copy()
+    for i, channel in enumerate(likelihood.channels):
+        if "delay" not in channel.timing.free or not channel.observable.follows_samples:
+            continue
+        place = likelihood.names.index(channel.qualified_name("delay"))
+        before, step = float(channel.timing.shift / channel.timing.step), float(channel.timing.step)
+        steps = round(before + float(theta[place])) - round(before)
+        if channel.samples.charges is not None or steps == 0 or abs(theta[place]) < 4.0 * sd[place]:
+            continue
+        late = channel.without_compression().replace_timing(shift=channel.timing.shift + steps * step)
+        late = dataclasses.replace(late, observable=late.electrical.delay_noise(steps))
+        likelihood, theta[place] = likelihood.replace_channel(i, late), theta[place] - steps
+    return likelihood, theta
 
 
 def _edge_mask(channel: ChannelLikelihood, margin: float = 3.0) -> np.ndarray:

@@ -76,6 +76,8 @@ def compress_channel(
             smooth = np.asarray(electrical.smooth)[part]
             how |= {"smooth": smooth, "slope": np.gradient(smooth, arrays[1])}
         compression = compress(*arrays, expected_terms=terms, delayed=_shifts_response(channel), **how)
+        if electrical.noise_gain is not None:
+            compression = dataclasses.replace(compression, noise_gain=electrical.noise_gain)
     return dataclasses.replace(channel, compression=compression), ""
 
 
@@ -128,8 +130,7 @@ def reason_against_table(
         if channel.channel == "I" and not channel.observable.follows_samples:
             return "the current of a fractional skin is not tabulated"
         return "a dispersive skin has no time constants" if start.circuit.grid is None else ""
-    is_direct = start.terms[channel.channel].direct is not None  # its table has V, which is not delayed
-    if _shifts_response(channel) and (is_direct or not can_delay(channel, start.tau)):
+    if _shifts_response(channel) and not can_delay(channel, start.tau):
         return _TIMING_REASON
     if table_multiple(start.tau) > max_multiple:
         return "the time constants of the circuit are too far apart"

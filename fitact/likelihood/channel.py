@@ -89,8 +89,11 @@ class ChannelLikelihood(eqx.Module):
         return step if name == "delay" else 2.0 * step / (time[-1] - time[0])
 
     def timing_mean(self, name: str) -> ArrayLike:
-        """Return the prior mean of a coordinate of `TIMING_NUISANCES`: a current is not late, wherever its rows are."""
-        return 0.0 if self.samples.charges is None else -self.timing.shift / self.timing_unit(name)
+        """Return the prior mean of a coordinate of `TIMING_NUISANCES`: nothing is late, from wherever a fit starts.
+
+        A stated drive is late by what it was found to be.
+        """
+        return -self.timing.shift / self.timing_unit(name) if self.observable.follows_samples else 0.0
 
     def replace_samples(self, **changes: Any) -> Self:
         """Return the channel with other fields of its samples."""

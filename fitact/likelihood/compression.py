@@ -80,9 +80,10 @@ class Compression(eqx.Module):
     observed: Float[Array, " rows"]  # the record, V or A
     observed_slope: Float[Array, " rows"]  # derivative of `observed` in log sigma, 0 but for `StudentExpansion`
     samples: Float[Array, ""]  # number of samples
-    # dV/dt of a measured drive (V/s) between the samples k - i - 1 and k - i, for the ages i from `origin` on; empty
-    # if the response cannot be delayed
-    steps: Float[Array, "ages rows"]
+    # dV/dt of a measured drive (V/s) between the samples k - i - 1 and k - i, for the ages i from `origin` on, and the
+    # noise of V (V), which no delay moves; empty if the response cannot be delayed
+    steps: Float[Array, "ages+1 rows"]
+    noise_gain: Float[Array, ""]  # of the noise of V in a response that can be delayed, for all parameters
     origin: Float[Array, ""]  # delay of `signal`, in time steps
     time_step: Float[Array, ""]  # s
     effects: Float[Array, "effects rows"] | None = None  # see `ChannelLikelihood.effects`
@@ -95,12 +96,12 @@ class Compression(eqx.Module):
         if not len(self.steps):
             return covered
         since = delay / self.time_step - self.origin
-        return covered & (since >= self.first_age) & (since <= self.first_age + len(self.steps))
+        return covered & (abs(since) <= self.reach)
 
     @property
-    def first_age(self) -> int:
-        """First of the ages of `steps`, relative to `origin`."""
-        return -(len(self.steps) // 2)
+    def reach(self) -> int:
+        """Largest delay from `origin`, in time steps."""
+        return len(self.steps) // 2
 
     def response(self, terms: HighpassTerms, delay: ArrayLike = 0.0) -> Float[Array, " rows"]:
         """Return the response of a circuit (compare `fitact.response`) with a `delay` (s), if it has `steps`."""
@@ -110,26 +111,41 @@ class Compression(eqx.Module):
                 growth, gains = self._shift(delay, tau)
                 weight, slopes = weight * growth, slopes + weight * growth * gains
             series.append(weight * self._series(tau, index))
+        if len(self.steps):
+            slopes = slopes.at[-1].add(self.noise_gain - terms.jump)
         total = self.signal @ (jnp.concatenate(series) if self.center.ndim else sum(series, jnp.zeros(())))
         total = jnp.pad(total, (0, self.observed.size - total.size)) + slopes @ self.steps
         if terms.direct is not None:
-            if self.voltage is None or len(self.steps):
-                raise TypeError("this compression holds no V, or delays it; a leak of the insulator needs V undelayed")
-            total = total + terms.direct * self.voltage
+            if self.voltage is None:
+                raise TypeError("this compression holds no V, which a leak of the insulator needs")
+            total = total + terms.direct * self._shift_voltage(self.voltage, delay)
         return total if terms.rate is None else total + terms.rate * self.rate
 
     def _shift(self, delay: ArrayLike, tau: ArrayLike) -> tuple[Array, Float[Array, "*nodes ages"]]:
         """Return factors p, q such that the response delayed by `delay` is p (signal + q @ steps).
 
         On the way back from a sample to an earlier time, the response u grows by 1 / decay, and each part of a linear
-        step of the drive that has not yet happened is subtracted.
+        step of the drive that has not yet happened is subtracted. The noise of V in u does not grow.
         """
-        xp, since = array_module(tau), delay - self.origin * self.time_step
-        ages = self.time_step * (self.first_age + np.arange(len(self.steps) + 1))
-        is_later = since > 0.0  # with `minimum` and `maximum`, the derivative would vanish at 0
+        xp, (since, ends, sign) = array_module(tau), self._shifted_parts(delay)
+        gained = -sign * tau * xp.exp(-ends[..., :-1] / tau) * xp.expm1(-xp.diff(ends) / tau)
+        noise = xp.expm1(-since / tau) * np.ones(1)
+        return xp.exp(since / tau), xp.concatenate([gained, noise], axis=-1)
+
+    def _shift_voltage(self, voltage: Float[Array, " rows"], delay: ArrayLike) -> Float[Array, " rows"]:
+        """Return V with a `delay` (s), beside its noise."""
+        if not len(self.steps):
+            return voltage
+        _, ends, sign = self._shifted_parts(delay)
+        return voltage + sign * array_module(ends).diff(ends) @ self.steps[:-1]
+
+    def _shifted_parts(self, delay: ArrayLike) -> tuple[Array, Float[Array, " ages+1"], Array]:
+        """Return the delay from `origin` (s), the ends of the parts of `steps` that it passes, and minus its sign."""
+        since = delay - self.origin * self.time_step
+        xp, is_later = array_module(since), since > 0.0  # with `minimum` and `maximum`, the derivative would vanish at 0
+        ages = self.time_step * np.arange(-self.reach, self.reach + 1)
         ends = xp.clip(ages, xp.where(is_later, 0.0, since), xp.where(is_later, since, 0.0))
-        gained = -tau * xp.exp(-ends[..., :-1] / tau) * xp.expm1(-xp.diff(ends) / tau)
-        return xp.exp(since / tau), xp.where(is_later, -gained, gained)
+        return since, ends, xp.where(is_later, -1.0, 1.0)
 
     def delay_derivative(self, terms: HighpassTerms) -> Float[Array, " rows"]:
         """Return the derivative of the response with respect to a delay (per s): u / tau - V' for each term."""
@@ -142,8 +158,7 @@ class Compression(eqx.Module):
 
     def _falling_response(self, terms: HighpassTerms, drive_slope: Float[Array, " rows"]) -> Float[Array, " rows"]:
         falling = HighpassTerms(tuple(w / t for w, t in zip(terms.weight, terms.tau, strict=True)), terms.tau)
-        jump = sum(terms.weight) + (0.0 if terms.direct is None else terms.direct)
-        return self.response(falling) - jump * drive_slope
+        return self.response(falling) - terms.jump * drive_slope
 
     def decays(self, tau: Array, index: int = 0) -> Float[Array, " rows"]:
         """Return e^{-(t - t0) / tau}, where t0 is the first sample; `index` is that of the time constant."""
@@ -170,7 +185,7 @@ class Compression(eqx.Module):
         inside = (log_tau - float(self.center)) / float(self.half_width)
         polynomials = np.polynomial.chebyshev.chebvander(inside, self.signal.shape[1] - 1).T
         signal = np.asarray(self.signal @ polynomials)
-        signal, steps, origin = self._move_origin(signal, np.exp(log_tau), delay)
+        signal, voltage, steps, origin = self._move_origin(signal, np.exp(log_tau), delay)
         signal, decay = (
             values.reshape(len(values), -1, x.size) @ to_series.T
             for values in (signal, np.asarray(self.decay @ polynomials))
@@ -179,7 +194,7 @@ class Compression(eqx.Module):
         basis, series = _significant_modes(signal[..., :terms].reshape(len(signal), -1), precision)
         charges, charge_series = _significant_modes(charge * decay[..., :terms].reshape(len(decay), -1), precision)
         columns = {name: np.asarray(getattr(self, name))[:, None] for name in ("observed_slope", "rate", "slope")}
-        functions = [*([] if self.effects is None else self.effects), *([] if self.voltage is None else [self.voltage])]
+        functions = [*([] if self.effects is None else self.effects), *([] if voltage is None else [voltage])]
         effects = np.reshape(functions, (-1, self.observed.size))
         found = orthogonal_coordinates(
             {"signal": basis, "steps": steps.T, "decay": charges, "effects": effects.T}
@@ -206,20 +221,24 @@ class Compression(eqx.Module):
 
     def _move_origin(
         self, signal: Float[np.ndarray, "rank nodes"], tau: np.ndarray, delay: tuple[float, float]
-    ) -> tuple[Float[np.ndarray, "rows nodes"], Float[np.ndarray, "ages rows"], float]:
-        """Return the signals at the nodes `tau`, delayed to a new origin in the range `delay`, its steps and itself."""
+    ) -> tuple[Float[np.ndarray, "rows nodes"], Float[np.ndarray, " rows"] | None, np.ndarray, float]:
+        """Return signals at the nodes `tau` and V, delayed to a new origin in the range `delay`, its steps and itself."""
         signal = np.pad(np.asarray(signal), ((0, self.observed.size - len(signal)), (0, 0)))
+        voltage = None if self.voltage is None else np.asarray(self.voltage)
         if not len(self.steps):
-            return signal, np.asarray(self.steps), 0.0
+            return signal, voltage, np.asarray(self.steps), 0.0
         low, high = (edge / float(self.time_step) - float(self.origin) for edge in delay)
         middle = round(0.5 * (low + high))
-        ages = min(2 ** math.ceil(math.log2(max(high - middle, middle - low, 1.0))), len(self.steps) // 2)
-        middle = min(max(middle, self.first_age + ages), -self.first_age - ages)
-        first = middle - ages - self.first_age
+        ages = min(2 ** math.ceil(math.log2(max(high - middle, middle - low, 1.0))), self.reach)
+        middle = min(max(middle, ages - self.reach), self.reach - ages)
+        first = middle - ages + self.reach
         origin = float(self.origin) + middle
-        growth, gains = self._shift(origin * float(self.time_step), tau[:, None])
+        since = np.asarray(origin * float(self.time_step))
+        growth, gains = self._shift(since, tau[:, None])
+        voltage = None if voltage is None else self._shift_voltage(voltage, since)
         signal = growth.T * (signal + np.asarray(self.steps).T @ gains.T)
-        return signal, np.asarray(self.steps)[first : first + 2 * ages], origin
+        kept = [*range(first, first + 2 * ages), 2 * self.reach]
+        return signal, voltage, np.asarray(self.steps)[kept], origin
 
 
 def _significant_modes(

@@ -1,7 +1,6 @@
 """Observables of channels: the signal of a circuit as a function of its parameters, and of delay and clock."""
 
 import dataclasses
-import math
 from typing import Any, Self
 
 import equinox as eqx
@@ -101,6 +100,7 @@ class ElectricalSignal(Observable):
     channel: Channel = eqx.field(static=True)  # "Vsc", "I", or the voltage that generates a force
     steady_state: bool = eqx.field(static=True)  # or from rest
     smooth: Float[Array, " samples"] | None = None  # recorded drive as a delay shifts it (`smooth_drive`), V
+    noise_gain: ArrayLike | None = None  # of the rest of the drive, for all parameters and delays
 
     @property
     def electrical(self) -> "ElectricalSignal":
@@ -118,16 +118,13 @@ class ElectricalSignal(Observable):
             drive = Sampled(np.asarray(drive.time)[:2], np.asarray(drive.samples)[:2], drive.period)
         return dataclasses.replace(self, drive=drive, smooth=smooth)
 
-    def delay_noise(self, steps: int, tau: float) -> Self:
-        """Return the signal with the noise of its recorded drive `steps` samples later, as the response is.
-
-        The table of responses lets what was recorded grow by exp(delay / tau); this is taken back.
-        """
+    def delay_noise(self, steps: int) -> Self:
+        """Return the signal with the noise of its recorded drive `steps` samples later, as the response is."""
         if self.smooth is None or steps == 0:
             return self
         assert isinstance(self.drive, Sampled)
-        smooth, growth = np.asarray(self.smooth), math.exp(-steps * float(self.timing.step) / tau)
-        noise = growth * np.roll(np.asarray(self.drive.samples) - smooth, steps)
+        smooth = np.asarray(self.smooth)
+        noise = np.roll(np.asarray(self.drive.samples) - smooth, steps)
         return dataclasses.replace(self, drive=dataclasses.replace(self.drive, samples=smooth + noise))
 
     def response(
@@ -157,18 +154,20 @@ class ElectricalSignal(Observable):
     def _delay_smooth_drive(self, recorded: Array, inputs: ChannelInputs, time: Array) -> Float[Array, " samples"]:
         """Return the response at the drive's `time` to the smooth drive, and undelayed to the rest of the drive.
 
-        The response to the rest decays, or grows, from the times at which V was `recorded` until that time, as in the
-        table of responses.
+        A parameter or a delay that made the noise of V smaller would be drawn there. So V without it, and the response
+        to the noise, have a gain that is the same for all. As in the table of responses, what V left until the time of
+        a sample decays, or grows, until the drive's time.
         """
         assert isinstance(self.drive, Sampled)
         smooth = dataclasses.replace(self.drive, samples=self.smooth)
         rest = dataclasses.replace(self.drive, samples=self.drive.samples - self.smooth)
         how: dict[str, Any] = {"steady_state": self.steady_state, "channel": self.channel}
         (total, _), terms = response_and_rate(inputs.circuit, smooth, time, **how), self.terms(inputs)
+        noise = rest.value(recorded)
         for weight, tau in zip(terms.weight, terms.tau, strict=True):
-            growth = jnp.exp((recorded - time) / tau)
-            total = total + weight * growth * highpass(rest, recorded, tau, steady_state=self.steady_state)
-        return total if terms.direct is None else total + terms.direct * rest.value(recorded)
+            before = highpass(rest, recorded, tau, steady_state=self.steady_state) - noise
+            total = total + weight * jnp.exp((recorded - time) / tau) * before
+        return total + self.noise_gain * noise
 
     def response_and_rate(self, inputs: ChannelInputs, time: Array) -> tuple[Array, ArrayLike | None]:
         """Return the response without what follows dV/dt, and the capacitance that does (F), or None."""

@@ -119,12 +119,14 @@ def compress(
         len(table.series),
         decays=measured and not table.is_grid,
         effects=samples.n_effects,
-        ages=2 * MAX_DELAY if measured and delayed else 0,
+        ages=2 * MAX_DELAY + 1 if measured and delayed else 0,
     )
     filtering = WhiteningState.start(taps, sum(sizes.values()), charges)
     if isinstance(drive, Sampled) and measured:
-        shifted = np.asarray(drive.samples)[: time.size] if smooth is None else smooth
-        parts = _accumulate_measured(table, drive, samples, filtering, MAX_DELAY if delayed else 0, shifted)
+        shifted = None
+        if delayed:
+            shifted = np.asarray(drive.samples)[: time.size] if smooth is None else smooth
+        parts = _accumulate_measured(table, drive, samples, filtering, shifted)
     else:
         is_simple = steady_state and taps is None and student is None
         period = samples_per_period(drive, time) if is_simple else None
@@ -430,13 +432,9 @@ def _accumulate_measured(
     drive: Sampled,
     samples: Samples,
     filtering: WhiteningState | None,
-    ages: int,
-    shifted: Float[np.ndarray, " samples"],
+    shifted: Float[np.ndarray, " samples"] | None,
 ) -> Iterator[np.ndarray]:
-    """Yield the inner products of each chunk for a measured drive.
-
-    `ages` steps of V before and after a sample are functions, those of V as a delay shifts it.
-    """
+    """Yield the inner products of each chunk for a measured drive; `shifted` is V as a delay shifts it."""
     time, voltage = samples.time, np.asarray(drive.samples)[: samples.time.size]
     length, step, first = chunk_length(time.size), float(table.step), float(voltage[0])
     x = step / table.nodes if is_exactly_uniform(time) and step < 300.0 * np.min(table.nodes) else None  # no overflow
@@ -446,16 +444,22 @@ def _accumulate_measured(
     voltages = chunks(samples._replace(observed=voltage, effects=None, charges=None), length)
     advance = jit(_advance_chunk, fast=time.size > MANY_SAMPLES)
     for number, (chunk, driven) in enumerate(zip(chunks(samples, length), voltages, strict=True)):
-        steps = drive_steps(shifted, number * length, length, ages) / step
+        steps = np.empty((0, length))
+        if shifted is not None:
+            steps = drive_steps(shifted, voltage, number * length, length, step)
         total, last, filtering = advance(table, chunk, driven.observed, steps, last, time[0], x, filtering)
         yield total
 
 
-def drive_steps(voltage: np.ndarray, first: int, length: int, ages: int) -> Float[np.ndarray, "ages samples"]:
-    """Return the step of V from sample k - i - 1 to k - i, for i from -`ages` to `ages` - 1, at `length` samples k."""
-    indices = np.clip(np.arange(first - ages, first + length + ages + 1), 0, voltage.size - 1)
-    steps = np.diff(voltage[indices])
-    return np.array([steps[i : i + length] for i in range(2 * ages)][::-1]).reshape(2 * ages, length)
+def drive_steps(
+    smooth: np.ndarray, voltage: np.ndarray, first: int, length: int, step: float
+) -> Float[np.ndarray, "ages+1 samples"]:
+    """Return `Compression.steps` at `length` samples, for `MAX_DELAY` ages before and after each, and 0 for padding."""
+    indices = np.clip(np.arange(first - MAX_DELAY, first + length + MAX_DELAY + 1), 0, voltage.size - 1)
+    slopes = np.diff(smooth[indices]) / step
+    noise = (voltage - smooth[: voltage.size])[first : first + length]
+    ages = [slopes[i : i + length] for i in reversed(range(2 * MAX_DELAY))]
+    return np.array([*ages, np.pad(noise, (0, length - noise.size))])
 
 
 def _advance_chunk(
@@ -531,6 +535,7 @@ def assemble_compression(
         observed_slope=observed_slope,
         samples=np.asarray(float(samples)),
         steps=functions["steps"].T,
+        noise_gain=np.asarray(np.sum(table.expected_series if table.is_grid else table.expected_series[0])),
         origin=np.zeros(()),
         time_step=table.step,
     )

@@ -5,6 +5,8 @@ free delay is drawn there; and the slope of V, by which a delay is found, is par
 drive only, and the noise of V stays where it was recorded.
 """
 
+import functools
+import itertools
 from typing import Any
 
 import numpy as np
@@ -12,17 +14,47 @@ from jax.typing import ArrayLike
 
 from fitact.compiled import array_module
 
-# fit of a parabola to nine samples, at the middle one (Savitzky and Golay, Anal. Chem. 36 (1964) 1627)
-_WEIGHTS = np.array([-21.0, 14.0, 39.0, 54.0, 59.0, 54.0, 39.0, 14.0, -21.0]) / 231.0
+# 2 S - S^2 of the mean S with the weights 1, 4, 6, 4 and 1 of a cubic B-spline, which leaves a cubic as it is
+_WEIGHTS = np.array([-1.0, -8.0, 4.0, 72.0, 122.0, 72.0, 4.0, -8.0, -1.0]) / 256.0
+_ROUNDS = 5  # of smoothing, each over twice as many samples as the one before
+_REACH = len(_WEIGHTS) // 2 * (2**_ROUNDS - 1)  # of all rounds to either side, in samples
 
 
-def smooth_drive(V: Any, noise: ArrayLike, max_deviation: float = 4.0) -> Any:
+def smooth_drive(V: Any, noise: ArrayLike, transition: float = 1.5) -> Any:
     """Return V (..., samples) without most of its white noise, of sd `noise` (V).
 
-    A sample that a parabola over nine samples misses by more than `max_deviation` sd, as at an edge, stays as it is.
+    V is what five rounds of smoothing leave, and the details that each took away (a wavelet transform with holes). A
+    detail below 4.5 sd of its noise in the finest, and below 2.5 in the coarsest, which has fewer independent values,
+    is left out. One `transition` sd above that is kept, so that an edge stays as it is.
     """
-    xp, reach = array_module(V), len(_WEIGHTS) // 2
-    padded = xp.pad(V, [(0, 0)] * (V.ndim - 1) + [(reach, reach)], mode="edge")
-    count = V.shape[-1]
-    smooth = sum(weight * padded[..., i : i + count] for i, weight in enumerate(_WEIGHTS))
-    return xp.where(abs(V - smooth) < max_deviation * noise, smooth, V)
+    xp, count = array_module(V), V.shape[-1]
+    around = [(0, 0)] * (V.ndim - 1) + [(_REACH, _REACH)]
+    scales = [each[..., :count] for each in _smooth(xp.pad(V, around, mode="reflect", reflect_type="odd"))]
+    smooth = scales[-1]
+    for number, sd in enumerate(_noise_of_details(), 1):
+        detail, unit = scales[number - 1] - scales[number], xp.maximum(sd * noise, np.finfo(float).tiny)
+        above = abs(detail) / unit - (2.0 + 2.5 / number)
+        smooth = smooth + detail * xp.clip(above / transition, 0.0, 1.0)
+    return smooth
+
+
+def _smooth(V: Any) -> list[Any]:
+    """Return V after each round, from none on, from the sample `_REACH` on; the ends are cut off round by round."""
+    last, cut, scales = V, 0, [V[..., _REACH:]]
+    for number in range(_ROUNDS):
+        distance, middle = 2**number, len(_WEIGHTS) // 2
+        count = last.shape[-1] - 2 * middle * distance
+        parts = [last[..., i * distance : i * distance + count] for i in range(len(_WEIGHTS))]
+        pairs = (_WEIGHTS[i] * (parts[i] + parts[-1 - i]) for i in range(middle))
+        last, cut = sum(pairs, _WEIGHTS[middle] * parts[middle]), cut + middle * distance
+        scales.append(last[..., _REACH - cut :])
+    return scales
+
+
+@functools.cache
+def _noise_of_details() -> tuple[float, ...]:
+    """Return the sd of each detail of white noise of sd 1."""
+    impulse = np.zeros(4 * _REACH)
+    impulse[2 * _REACH] = 1.0
+    scales = [each[: 2 * _REACH] for each in _smooth(impulse)]
+    return tuple(float(np.linalg.norm(finer - wider)) for finer, wider in itertools.pairwise(scales))

@@ -12,7 +12,6 @@ from typing import NamedTuple, Self
 import numpy as np
 from jaxtyping import Float
 
-from fitact.data.record import white_noise_sd
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.charge_rows import LAG, ChargeRows, filter_highpass, step_means, whiten_rows
 from fitact.likelihood.compression import (
@@ -26,7 +25,6 @@ from fitact.likelihood.compression import (
 from fitact.likelihood.likelihood import CircuitValues
 from fitact.likelihood.noise import Whitening
 from fitact.likelihood.projection import (
-    MAX_DELAY,
     TableNodes,
     assemble_compression,
     drive_steps,
@@ -72,10 +70,11 @@ class WindowCompressor:
     time: Float[np.ndarray, " samples"]  # from the start of a window, s
     # decays in the combinations of the table, and the baseline that each channel has; rows of a current
     shared: tuple[Float[np.ndarray, "functions samples"], ...]
+    noise_V: float  # sd of the noise of V, V
 
     @classmethod
     def from_channels(
-        cls, channels: Sequence[ChannelLikelihood], circuit: CircuitValues, samples: int, step: float
+        cls, channels: Sequence[ChannelLikelihood], circuit: CircuitValues, samples: int, step: float, noise_V: float
     ) -> Self:
         """Make the tables around the time constants of a circuit, a factor `REACH` either way."""
         time = step * np.arange(samples)
@@ -90,7 +89,7 @@ class WindowCompressor:
             functions = np.vstack([_decays(table, time), *(baseline[name] for name in _baseline_names(each))])
             tables.append(table)
             shared.append(functions if each.samples.charges is None else step_means(functions))
-        return cls(tuple(channels), tuple(tables), time, tuple(shared))
+        return cls(tuple(channels), tuple(tables), time, tuple(shared), noise_V)
 
     def compress(
         self,
@@ -147,8 +146,8 @@ class WindowCompressor:
             used = weight if whitening is None else whitening.mask
             count = late.size if used is None else int(np.count_nonzero(used))
             if channel.timing.free:
-                smooth = smooth_drive(functions[-2], white_noise_sd(functions[-2]))
-                steps = drive_steps(smooth, 0, late.size, MAX_DELAY) / step
+                smooth = smooth_drive(functions[-2], self.noise_V)
+                steps = drive_steps(smooth, functions[-2], 0, late.size, step)
         rest = observed - functions[-1] - (0.0 if table.expected_rate is None else table.expected_rate * rate)
         own = {"signal": functions[:rank], "decay": shared[:charged], "steps": steps}
         own |= zip(_baseline_names(channel), shared[charged:, None], strict=True)

@@ -21,6 +21,11 @@ class HighpassTerms(NamedTuple):
     rate: ArrayLike | None = None  # s times the weight's unit; None means no such term
     direct: ArrayLike | None = None  # at zero frequency, in the weight's unit; None means that the insulator blocks
 
+    @property
+    def jump(self) -> ArrayLike:
+        """Height of the response to a jump of 1, beside what follows `rate`."""
+        return sum(self.weight, 0.0 if self.direct is None else self.direct)
+
     def stack(self) -> tuple[Array, Array]:
         """Return the weights and the time constants as arrays."""
         weight, tau = (

@@ -172,8 +172,19 @@ def build_problem(
         sigma_prior=tuple(noise.get(f"sigma_{each.letter}".rstrip("_")) for each in channels),
         use_prior=use_prior,
     )
+    likelihood = _set_noise_gains(likelihood, likelihood.prior.log_mean)
     start = start_from_estimates(likelihood, [source.start for source in sources])
-    return Problem(likelihood, tuple(sources), start, coordinates)
+    return Problem(_set_noise_gains(likelihood, start), tuple(sources), start, coordinates)
+
+
+def _set_noise_gains(likelihood: Likelihood, theta: Float[np.ndarray, " circuit_parameters"]) -> Likelihood:
+    """Return the likelihood in which the noise of recorded drives has the gains of the circuit at theta."""
+    circuit = likelihood.evaluate_circuit(theta)
+    for i, channel in enumerate(likelihood.channels):
+        if isinstance(channel.observable, ElectricalSignal) and channel.electrical.smooth is not None:
+            gain = np.asarray(circuit.terms[channel.channel].jump, dtype=float)
+            likelihood = likelihood.replace_channel(i, channel.replace_observable(noise_gain=gain))
+    return likelihood
 
 
 def _reserve_effects(channel: ChannelLikelihood) -> ChannelLikelihood:
@@ -250,7 +261,7 @@ def _build_channel(
     weight = None if weight is None else pad_weight(weight)
     colour, noise = _noise(record, channel, scene)
     # edges of a shifted drive are known only to within a step, which affects g; samples of I there are excluded
-    free = ("delay",) if channel == "Vsc" and (choice.shift != 0.0 or _has_skew(record, scene)) else ()
+    free = ("delay",) if channel == "Vsc" and (choice.shift != 0.0 or _skew_sd(record, scene, choice) > 0.0) else ()
     has_stray = channel == "I" and (scene.stray_capacitance() > 0.0 or STRAY in bare.prior.names)
     smooth = _smooth_drive(record) if channel == "Vsc" and _can_smooth(choice, template) else None
     shift, step = (np.asarray(each, dtype=float) for each in (choice.shift, record.time_step))
@@ -376,11 +387,9 @@ def _can_smooth(choice: DriveModel, template: Circuit) -> bool:
 
 
 def _smooth_drive(record: Record) -> Float[np.ndarray, " samples"] | None:
-    """Return V as a delay shifts it; None if it has no noise, or less than half of its rounding's beside it."""
-    noise, rounding = record.noise_parts("V")
-    if noise == 0.0 or math.hypot(rounding, 0.5 * rounding) > noise:
-        return None
-    return pad_samples(smooth_drive(record["V"], noise))
+    """Return V as a delay shifts it; None if it has no noise."""
+    noise = record.noise("V")
+    return pad_samples(smooth_drive(record["V"], noise)) if noise else None
 
 
 def _require_whole_drive(record: Record, choice: DriveModel) -> None:
@@ -417,9 +426,16 @@ def _noise(record: Record, channel: str, scene: Scene) -> tuple[Autoregression |
     return estimate_quiet_noise(record, channel, quiet)
 
 
-def _has_skew(record: Record, scene: Scene, min_part: float = 0.01) -> bool:
-    """Return whether the stated instruments may delay Vsc against V by more than `min_part` of a time step."""
-    return scene.skew_limit("Vsc", record.time_step) > min_part * record.time_step
+def _skew_sd(record: Record, scene: Scene, choice: DriveModel, min_part: float = 0.01) -> float:
+    """Return the prior sd of the delay of Vsc against V in time steps; 0 if it is below `min_part` of a step.
+
+    It is one step if V was recorded and nobody stated with what: converters take channels in turn, and probes delay
+    them.
+    """
+    if choice.name == "measured" and not (scene.instrument.pieces("V") or scene.instrument.pieces("Vsc")):
+        return 1.0
+    limit = scene.skew_limit("Vsc", record.time_step) / record.time_step
+    return limit / math.sqrt(3.0) if limit > min_part else 0.0
 
 
 def _prior_of_nuisances(
@@ -443,9 +459,8 @@ def _timing_sd(record: Record, choice: DriveModel, scene: Scene, channel: str) -
         clock_sd = max(clock_sd, frequency_error(record, choice.name) * record.time.size)
     # samples near an ideal edge determine the delay only to within one step, in the middle of which it starts
     delay_sd = math.sqrt(1.0 / 12.0) if has_ideal_edges(choice.drive) else 5.0
-    if _has_skew(record, scene):
-        step_sd = delay_sd if choice.shift != 0.0 else 0.0
-        delay_sd = math.hypot(step_sd, scene.skew_limit("Vsc", record.time_step) / record.time_step / math.sqrt(3.0))
+    if skew_sd := _skew_sd(record, scene, choice):
+        delay_sd = math.hypot(delay_sd if choice.shift != 0.0 else 0.0, skew_sd)
     return np.array([delay_sd, clock_sd])
 
 

@@ -193,7 +193,8 @@ def find_model(windows: Sequence[Window], scene: Scene, step: float, source: str
     fitted = fit(record, scene)
     with double_precision():
         circuit = fitted.likelihood.evaluate_circuit(fitted.theta)
-        compressor = WindowCompressor.from_channels(fitted.likelihood.channels, circuit, time.size, step)
+        fitted_channels, noise_V = fitted.likelihood.channels, record.noise("V")
+        compressor = WindowCompressor.from_channels(fitted_channels, circuit, time.size, step, noise_V)
     parts = max(1, math.floor((time[-1] + step) * frequency))
     current = _describe_current(fitted, record, circuit)
     return WindowModel(fitted, compressor, parts, float(np.std(first.channels["V"])), current, circuit.tau)

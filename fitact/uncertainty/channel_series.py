@@ -25,6 +25,7 @@ class Timing(NamedTuple):
     place: int  # coordinate of theta
     unit: float  # of this coordinate: s for a delay, relative for a clock
     total: float  # its value, beyond what the drive was shifted by before the fit
+    is_expected: bool = False  # whether it is within three prior sd, and there before the data ask for it
 
 
 class ChannelSamples(NamedTuple):

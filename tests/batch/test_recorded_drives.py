@@ -49,7 +49,7 @@ def accepted(records: list[fitact.Record]) -> np.ndarray:
 
 
 def assert_equal_to_separate_fit(
-    row: dict, made: fitact.Record, sd_error: float = 1e-3, error: float = 1e-6, figure_error: float = 1e-5
+    row: dict, made: fitact.Record, sd_error: float = 1e-3, error: float = 1e-6, figure_error: float = 5e-4
 ) -> None:
     alone = fitact.fit(made, SCENE)
     assert (row["result"], row["trusted"], row["samples"]) == (alone.result, alone.trusted, alone.figures["samples"])
@@ -64,7 +64,7 @@ def assert_equal_to_separate_fit(
         assert row[name] == pytest.approx(np.exp(log), rel=error)
         assert row[f"{name}_log_sd"] == pytest.approx(log_sd, rel=sd_error)
     assert row["force_from_prior"] == pytest.approx(alone.identifiability.force_from_prior, rel=1e-4)
-    # a fit scales the noise of V that it delays by whole steps for the time constant from which it started
+    # the noise of V has the gain from which a fit starts, which differs by some per cent, and is 0.4 % of the variance
     assert row["chi2_reduced"] == pytest.approx(alone.figures["chi2_reduced"], rel=figure_error)
 
 
@@ -98,35 +98,43 @@ def test_each_row_is_the_fit_of_its_record(skewed):
     assert rows[1]["freed"] == "offset, charge, delay"
     for number in (0, 1, 4, 5, 6, 7):
         assert_equal_to_separate_fit(rows[number], skewed[number])
-    assert rows[4]["result"] == "misfit"
+    assert rows[4]["result"] == "structure"
     assert rows[9]["result"] == "refused"
     assert "clipped" in rows[9]["message"]
 
 
-def test_without_a_skew_no_delay_is_fitted():
-    records = [record(number, delay=0.0) for number in range(16)]
+def test_optimum_is_that_of_scipy_on_the_samples():
+    """Samples that follow V within a step of the record; a fit shifts V without most of its noise."""
+    records = [record(number, delay=0.3) for number in range(16)]
     assert accepted(records).all()
     rows = fitact.fit_many(records, SCENE, progress=False)
     for number in (0, 7):
-        assert rows[number]["freed"] == "charge"
+        assert rows[number]["freed"] == "charge, delay"
         assert_equal_to_separate_fit(rows[number], records[number])
     sigma, voltage, observed = rows[7]["noise"], records[7]["V"], records[7]["Vsc"]
     log_sds = np.sqrt(np.log1p(np.square(RELATIVE_SDS)))
 
     def residuals(parameters):
-        """Filter the piecewise linear drive exactly, and use the prior; the first sample is a jump from 0."""
+        """Filter the piecewise linear drive exactly, to a time within each step, and use the prior."""
         R, C, Ci = np.exp(parameters[:3])
         g, b = Ci / (2.0 * Ci + C), R * (2.0 * Ci + C)
         x = STEP / b
         gain = -np.expm1(-x) / x
-        response, _ = scipy.signal.lfilter([gain], [1.0, -np.exp(-x)], np.diff(voltage), zi=[np.exp(-x) * voltage[0]])
-        model = g * np.append(voltage[0], response) + parameters[3] * np.exp(-TIME / b)
-        return np.append((observed - model) / sigma, (parameters[:3] - np.log(MEDIANS)) / log_sds)
+        rise = np.diff(voltage)
+        response, _ = scipy.signal.lfilter([gain], [1.0, -np.exp(-x)], rise, zi=[np.exp(-x) * voltage[0]])
+        before, since = np.append(voltage[0], response)[:-1], (1.0 - parameters[4]) * x
+        late = before * np.exp(-since) - np.expm1(-since) / x * rise
+        model = (g * np.append(voltage[0], late) + parameters[3] * np.exp(-TIME / b))[6:-6]
+        off_prior = np.append((parameters[:3] - np.log(MEDIANS)) / log_sds, parameters[4])
+        return np.append((observed[6:-6] - model) / sigma, off_prior)
 
-    start = np.append(np.log([rows[7][name] for name in NAMES]), 0.0)
+    start = np.append(np.log([rows[7][name] for name in NAMES]), [0.0, 0.3])
     tight = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15}
-    optimum = scipy.optimize.least_squares(residuals, start, jac="3-point", x_scale=[0.05, 0.05, 0.05, 0.1], **tight).x
-    np.testing.assert_allclose(start[:3], optimum[:3], rtol=0.0, atol=1e-6)
+    scale = [0.05, 0.05, 0.05, 0.1, 0.1]
+    optimum = np.exp(scipy.optimize.least_squares(residuals, start, jac="3-point", x_scale=scale, **tight).x[:3])
+    total = 2.0 * optimum[2] + optimum[1]
+    for name, value in (("g", optimum[2] / total), ("b", optimum[0] * total)):
+        assert abs(np.log(rows[7][name] / value)) < 0.05 * rows[7][f"{name}_log_sd"]
 
 
 def test_records_of_different_skew_are_fitted_together_within_a_step():
@@ -137,7 +145,7 @@ def test_records_of_different_skew_are_fitted_together_within_a_step():
     assert_equal_to_separate_fit(rows[0], records[0])
     # the skew of the last rounds to another whole step, so that its fit takes the noise of V from another sample, which
     # moves estimates by some hundredths of a standard error
-    assert_equal_to_separate_fit(rows[16], records[16], sd_error=3e-3, error=2e-5, figure_error=3e-3)
+    assert_equal_to_separate_fit(rows[16], records[16], sd_error=3e-3, error=2e-5, figure_error=6e-3)
 
 
 def test_edges_between_two_samples_free_a_gain():
@@ -147,7 +155,7 @@ def test_edges_between_two_samples_free_a_gain():
     rows = fitact.fit_many(records, SCENE, progress=False)
     for number in (0, 7):
         assert rows[number]["freed"] == "charge, gain, delay"
-        assert_equal_to_separate_fit(rows[number], records[number], sd_error=0.1)
+        assert_equal_to_separate_fit(rows[number], records[number], sd_error=0.1, error=3e-6)
 
 
 @pytest.mark.slow  # simulates and fits records of 25,000 samples, for which programs of their own are compiled

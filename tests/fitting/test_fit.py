@@ -20,7 +20,7 @@ def test_shipped_record_with_its_measured_drive(finger_fit: fitact.Fit, finger_t
         assert finger_fit.derived()[name]["q50"] == pytest.approx(finger_truth[name], rel=0.01)
         assert abs(deviation(finger_fit, name, finger_truth[name])) < 3.0
     for name, s in finger_fit.parameters().items():
-        assert s["q025"] < finger_truth[name] < s["q975"]
+        assert s["q025"] < (finger_truth | {"delay": 0.0})[name] < s["q975"]
     assert finger_fit.linear["offset"] == pytest.approx(0.08, abs=0.005)
     assert finger_fit.figures["chi2_reduced"] == pytest.approx(1.0, abs=0.1)
 
@@ -45,30 +45,37 @@ def test_shipped_record_with_a_trapezoid_that_lacks_the_overshoot(finger_path, f
 
 
 def test_errors_are_those_of_the_linear_theory(finger_fit: fitact.Fit):
-    """scipy's least squares on the same record: a and b, with free offset and charge, without a prior."""
+    """scipy's least squares on the same record: a and b, with free offset, charge and delay, without a prior.
+
+    The delay is within a step, so that V is a line from the sample before. fitact leaves out the six samples at each
+    end, and shifts V without most of its noise of 0.4 V, whose slope acts as a part of a step here.
+    """
     scipy_optimize = pytest.importorskip("scipy.optimize")
     record = finger_fit.record
     time, step = record.time - record.time[0], record.time_step
 
     def vsc(p: np.ndarray) -> np.ndarray:
-        g, b, offset, charge = p
+        g, b, offset, charge, delay = p
         keep = np.exp(-step / b)
         gain = -np.expm1(-step / b) * b / step
         u = np.empty_like(time)
         u[0] = 0.0
-        for i, dv in enumerate(np.diff(record["V"])):
+        rise = np.diff(record["V"])
+        for i, dv in enumerate(rise):
             u[i + 1] = keep * u[i] + gain * dv
-        return g * u + offset + charge * np.exp(-time / b)
+        since = (1.0 - delay) * step
+        u[1:] = u[:-1] * np.exp(-since / b) - np.expm1(-since / b) * b / step * rise
+        return (g * u + offset + charge * np.exp(-time / b))[6:-6]
 
-    start = [0.05, 4e-3, 0.1, -4.0]
+    start = [0.05, 4e-3, 0.1, -4.0, 0.01]
     found = scipy_optimize.least_squares(
-        lambda p: vsc(p) - record["Vsc"], start, x_scale=[0.05, 4e-3, 0.1, 1.0], xtol=1e-12
+        lambda p: vsc(p) - record["Vsc"][6:-6], start, x_scale=[0.05, 4e-3, 0.1, 1.0, 0.1], xtol=1e-12
     )
-    sigma = np.sqrt(2.0 * found.cost / (time.size - 4))
+    sigma = np.sqrt(2.0 * found.cost / (time.size - 17))
     sd = sigma * np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
     for i, name in enumerate(("g", "b")):
         s = finger_fit.derived()[name]
-        assert s["q50"] == pytest.approx(found.x[i], rel=2e-6)
+        assert s["q50"] == pytest.approx(found.x[i], abs=0.3 * sd[i])
         assert s["sd"] == pytest.approx(sd[i], rel=0.01)
 
 

@@ -69,7 +69,8 @@ def test_the_compression_is_the_sum_over_the_samples(kind: str):
         assert reason == ""
         assert compressed.compression.voltage is not None
         for step in (0.0, 0.2):
-            inputs = likelihood.channel_inputs(theta + step * np.array([1.0, -0.5, 0.3, 0.4]))
+            change = np.array([1.0, -0.5, 0.3, 0.4, -0.7])[: theta.size]  # the last is the delay of a recorded drive
+            inputs = likelihood.channel_inputs(theta + step * change)
             exact, found = (float(each.log_likelihood(inputs, np.log(0.1))) for each in (channel, compressed))
             assert found == pytest.approx(exact, rel=1e-9, abs=1e-3)
 

@@ -34,17 +34,22 @@ def scene(**drive: object) -> fitact.Scene:
 
 
 def assert_posterior(
-    fit: fitact.Fit, delay_sd: float, unit_response, used: slice, half_widths: tuple[float, float, float], counts
+    fit: fitact.Fit,
+    delay_prior: tuple[float, float],
+    unit_response,
+    used: slice,
+    half_widths: tuple[float, float, float],
+    counts,
 ) -> np.ndarray:
     """Assert that a posterior is that of the quadrature over log b, log Csc and the delay in steps; return its delays.
 
-    `unit_response` is a function of b (s) and the delay in steps. The prior of the delay is normal around the start of
-    the fit, with `delay_sd` in steps. The signal is proportional to g, so a grid in g needs no sum over the samples.
+    `unit_response` is a function of b (s) and the delay in steps. The prior of the delay is normal, with the mean and
+    the sd of `delay_prior`, in steps. The signal is proportional to g, so a grid in g needs no sum over the samples.
     """
     start, observed = fit.likelihood.timing["delay"][0] / STEP, fit.record["Vsc"][used]
 
     def log_prior(log_Rsc: np.ndarray, log_Csc: np.ndarray, delay: np.ndarray) -> np.ndarray:
-        return default_prior(log_Rsc, log_Csc) + normal(delay, start, delay_sd)
+        return default_prior(log_Rsc, log_Csc) + normal(delay, *delay_prior)
 
     def log_density(log_b: np.ndarray, log_Csc: np.ndarray, delay: np.ndarray) -> np.ndarray:
         total = 2.0 * CI + np.exp(log_Csc)
@@ -97,7 +102,12 @@ def test_delay_of_an_ideal_square_wave(name: str):
     assert isinstance(fit.likelihood.channels[0].compression, Interpolation)
     width = 0.012 * noise + 0.02
     delays = assert_posterior(
-        fit, math.sqrt(1.0 / 12.0), unit_response, slice(None), (2.0 * width, width, 1.5), (25, 41, 300)
+        fit,
+        (fit.likelihood.timing["delay"][0] / STEP, math.sqrt(1.0 / 12.0)),  # around the start of the fit
+        unit_response,
+        slice(None),
+        (2.0 * width, width, 1.5),
+        (25, 41, 300),
     )
     if name == "between two samples":
         assert np.floor(delays.min()) == np.floor(delays.max())
@@ -154,7 +164,7 @@ def test_delay_of_a_measured_drive(name: str):
     assert fit.result == "successful"
     used = slice(MARGIN, SAMPLES - MARGIN)
     half_widths = 0.03 * noise, 0.016 * noise, abs(late - fit.likelihood.timing["delay"][0] / STEP) + 0.4 * noise
-    delays = assert_posterior(fit, 5.0, unit_response, used, half_widths, (31, 41, 121))
+    delays = assert_posterior(fit, (0.0, 1.0), unit_response, used, half_widths, (31, 41, 121))
     if name == "half a step":
         assert np.floor(delays.min()) == np.floor(delays.max())
     elif name != "beyond the table":
