@@ -93,7 +93,7 @@ def _represent_by_uniform_samples(e: Experiment, max_samples: int = 4096) -> Exp
     step, period = float(np.median(np.diff(time))), getattr(drive, "period", None)
     if isinstance(drive, Sampled):
         time = time[: time.size if period is not None else 2 * max_samples]  # whose beginning represents a long record
-        drive = _remove_noise(drive, time.size, e.noise["V"])
+        drive = _remove_noise(drive, float(time[-1]), e.noise["V"])
     if e.steady_state and period is not None:
         length, count = float(period), max(round(float(period) / step), 8)
     else:
@@ -103,15 +103,16 @@ def _represent_by_uniform_samples(e: Experiment, max_samples: int = 4096) -> Exp
     return dataclasses.replace(e, drive=drive, time=grid, records=e.records * np.size(e.time) / count)
 
 
-def _remove_noise(drive: Sampled, count: int, noise: float, min_ratio: float = 10.0) -> Sampled:
+def _remove_noise(drive: Sampled, end: float, noise: float, min_ratio: float = 10.0) -> Sampled:
     """Return a measured drive with those of its lines whose power is more than `min_ratio` times that of the noise.
 
-    The noise would pass for a known drive otherwise. The first `count` samples are used, or those of its period.
+    The noise would pass for a known drive otherwise. Samples until the time `end` (s) are used, or those of its period.
     """
-    time, samples = np.asarray(drive.time)[:count], np.asarray(drive.samples)[:count]
-    if drive.period is not None:  # samples that fill an array up follow
-        count = int(np.searchsorted(time, time[0] + float(drive.period) - 0.5 * (time[1] - time[0])))
-        time, samples = time[:count], samples[:count]
+    time, samples = np.asarray(drive.time), np.asarray(drive.samples)
+    last = min(end, time[-1]) if drive.period is None else time[0] + float(drive.period) - time[1] + time[0]
+    # half a step for rounding; samples that fill an array up follow
+    count = 1 + int(np.searchsorted(time, last - 0.5 * (time[1] - time[0])))
+    time, samples = time[:count], samples[:count]
     trend = np.zeros_like(samples) if drive.period is not None else np.linspace(samples[0], samples[-1], count)
     lines = np.fft.rfft(samples - trend)
     lines[np.abs(lines) ** 2 < min_ratio * count * noise**2] = 0.0

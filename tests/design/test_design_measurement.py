@@ -263,7 +263,7 @@ def test_a_record_s_values_and_noise(finger_fit: fitact.Fit, monkeypatch):
     known = finger_fit.identifiability
     assert found.now.force_sd == pytest.approx(known.force_sd, rel=0.01)
     assert found.now.contraction == pytest.approx(known.force_contraction, rel=0.01)
-    assert list(found.now.sd.values()) == pytest.approx(finger_fit.sd.tolist(), rel=0.02)
+    assert list(found.now.sd.values()) == pytest.approx(finger_fit.sd[:3].tolist(), rel=0.02)  # the last is a delay
     assert found.trusted
 
 

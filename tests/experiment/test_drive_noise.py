@@ -153,3 +153,17 @@ def test_quieter_V_is_an_option_where_its_noise_is_stated():
     assert option.force_sd == pytest.approx(evaluate_design(CandidateDesign((half,)), (), gradient).force_sd)
     stated = dataclasses.replace(BENCH, noise=BENCH.noise | {"V": 0.0})
     assert change(CandidateDesign((stated,))) is None
+
+
+def test_a_recorded_drive_serves_samples_between_its_own():
+    """The information of twice as many samples is that with the same drive, recorded twice as fast."""
+    bench = dataclasses.replace(BENCH, channels=("Vsc", "I"), steady_state=False)
+    found = []
+    for each in (1, 2):
+        time = np.arange(2 * COUNT * each) / (FREQUENCY * COUNT * each)
+        noise = 1e-3 * np.random.default_rng(0).standard_normal(time.size)
+        drive = fitact.Sampled(time, np.asarray(TRAPEZOID.value(time)) + noise)
+        finer = np.arange(4 * COUNT - 2) / (2.0 * FREQUENCY * COUNT)
+        rows = jacobian(dataclasses.replace(bench, drive=drive, time=finer, noise=BENCH.noise | {"V": 1e-3}))
+        found.append(rows.T @ rows)
+    np.testing.assert_allclose(*map(np.diagonal, found), rtol=0.01)

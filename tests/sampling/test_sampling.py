@@ -94,7 +94,7 @@ def test_resumed_chain_is_the_undisturbed_one(finger_fit: fitact.Fit, tmp_path, 
     whole = short(finger_fit, 3, max_steps=200)
     np.testing.assert_array_equal(resumed.points, whole.points)
     backend = emcee.backends.HDFBackend(path, name="ensemble_2", read_only=True)
-    assert backend.get_chain().shape == (resumed.convergence.steps, 16, 4)
+    assert backend.get_chain().shape == (resumed.convergence.steps, 16, 5)
 
 
 def test_chain_of_another_record_scene_or_seed_is_refused(finger_fit: fitact.Fit, tmp_path):
