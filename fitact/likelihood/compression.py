@@ -158,7 +158,8 @@ class Compression(eqx.Module):
 
     def _falling_response(self, terms: HighpassTerms, drive_slope: Float[Array, " rows"]) -> Float[Array, " rows"]:
         falling = HighpassTerms(tuple(w / t for w, t in zip(terms.weight, terms.tau, strict=True)), terms.tau)
-        return self.response(falling) - terms.jump * drive_slope
+        without_noise = dataclasses.replace(self, noise_gain=jnp.zeros(()))
+        return without_noise.response(falling) - terms.jump * drive_slope
 
     def decays(self, tau: Array, index: int = 0) -> Float[Array, " rows"]:
         """Return e^{-(t - t0) / tau}, where t0 is the first sample; `index` is that of the time constant."""

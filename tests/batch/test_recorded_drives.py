@@ -9,6 +9,8 @@ import scipy.signal
 import fitact
 from fitact.batch.fit_many import RecordGroup
 from tests.batch.test_many_posteriors import assert_quantiles_of_separate_posterior
+from tests.likelihood.test_smooth_drive import SKIN
+from tests.likelihood.test_smooth_drive import record as slow_record
 
 NAMES = ("Rsc", "Csc", "Ci")
 MEDIANS, RELATIVE_SDS = np.array([130e3, 18e-9, 1.35e-9]), np.array([0.5, 0.5, 0.05])
@@ -135,6 +137,17 @@ def test_optimum_is_that_of_scipy_on_the_samples():
     total = 2.0 * optimum[2] + optimum[1]
     for name, value in (("g", optimum[2] / total), ("b", optimum[0] * total)):
         assert abs(np.log(rows[7][name] / value)) < 0.05 * rows[7][f"{name}_log_sd"]
+
+
+def test_the_stated_errors_hold_for_a_skew_of_an_eighth_of_a_step():
+    """It moves b by 8 standard errors of a fit without delay, which the BIC would prefer in half of these records."""
+    scene = fitact.Scene.from_dict({"drive": {"waveform": "measured"}, "prior": {"Ci": {"relative_sd": 0.1}}})
+    rows = fitact.fit_many([slow_record(seed, 1, 0.1, bits=12) for seed in range(16)], scene, progress=False)
+    assert all(row["trusted"] for row in rows)
+    b = SKIN[0] * (2.0 * SKIN[2] + SKIN[1])
+    off = np.array([np.log(row["b"] / b) / row["b_log_sd"] for row in rows])
+    assert np.max(np.abs(off)) < 3.5
+    assert np.sqrt(np.mean(np.square(off))) < 1.5  # a chi-square of 16 degrees of freedom exceeds 2.25 x 16 in 0.3 %
 
 
 def test_records_of_different_skew_are_fitted_together_within_a_step():
