@@ -201,14 +201,15 @@ def test_two_equal_records_are_worth_twice_one(first: fitact.Record, alone: fita
 
 
 @pytest.mark.slow
-def test_records_of_different_drives_noises_gains_and_offsets(first: fitact.Record, alone: fitact.Fit):
+def test_records_of_different_drives_noises_gains_and_offsets(first: fitact.Record):
     """A measured trapezoid, and a named sine of another amplitude and frequency."""
     sine = record(
         [SKIN, SKIN], kind="sine", amplitude=50.0, per_period=500, seed=2, gain=1.03, offset=0.3, noise=2.0 * NOISE_V
     )
     drive = {"waveform": "sine", "peak_to_peak": 100.0, "frequency": 200.0}
     gained = fitact.Scene.from_dict({"drive": drive, "measurement": {"gain_relative_sd": 0.05}})
-    both = fitact.fit([first, sine], [fitact.Scene.from_dict({"drive": {"waveform": "measured"}}), gained])
+    measured = fitact.Scene.from_dict({"drive": {"waveform": "measured"}})
+    both, alone = fitact.fit([first, sine], [measured, gained]), fitact.fit(first, measured)
     assert both.trusted
     assert both.traces[0].sigma == pytest.approx(NOISE_V, rel=0.1)
     assert both.traces[1].sigma == pytest.approx(2.0 * NOISE_V, rel=0.15)
