@@ -49,7 +49,7 @@ from peers import (
 from timing import process_seconds, show
 
 import fitact
-from fitact.data.readers.read import write_csv
+from fitact.readers.read import write_csv
 
 SCENE = """[drive]
 waveform = "square"

@@ -26,8 +26,8 @@ import fitact
 from data_synth.keys import validate_sections
 from fitact.batch import campaign
 from fitact.batch.fit_many import row_from_fit
-from fitact.data.readers.read import write_csv
 from fitact.model.circuit import FINGER_PARAMETERS
+from fitact.readers.read import write_csv
 
 PAGE = Path(__file__).parents[1] / "docs" / "what_works.md"
 BEGIN, END = "<!-- written by tests/capabilities.py -->\n", "<!-- end -->\n"

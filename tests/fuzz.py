@@ -21,10 +21,10 @@ from pathlib import Path
 import numpy as np
 
 import fitact
-from fitact.data.preview import preview
-from fitact.data.readers.capture import resolve_channels
-from fitact.data.readers.read import read_capture
-from fitact.data.readers.spectrum import is_spectrum
+from fitact.inspection.preview import preview
+from fitact.readers.capture import resolve_channels
+from fitact.readers.read import read_capture
+from fitact.readers.spectrum import is_spectrum
 from tests.layouts.layout import REAL, SCOPE
 from tests.layouts.records import RECORDS
 from tests.layouts.spectra import SPECTRA

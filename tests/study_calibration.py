@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import fitact
-from fitact.data.study import nest_levels
+from fitact.readers.study import nest_levels
 from tests.calibration import AMPLITUDE, THICKNESS, collect, skin_voltage
 from tests.population_calibration import FREQUENCY, PRIOR, SPREAD, draw_medians, show_coverage
 

@@ -24,11 +24,11 @@ import jax
 from fitact.batch.fit_many import Fits, Row, failure_row, fit_many, list_sources, read_finger
 from fitact.batch.sample_many import add_posterior, sample_many
 from fitact.compiled import available_cores
-from fitact.data.study import Study
 from fitact.errors import InputError
 from fitact.files import to_json
 from fitact.fitting.fit import fit
 from fitact.progress import track_progress
+from fitact.readers.study import Study
 from fitact.sampling.ensemble import sample
 from fitact.scene.scene import Scene
 

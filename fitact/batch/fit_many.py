@@ -17,7 +17,6 @@ from fitact.batch.recorded_drive import RecordedDriveProblem
 from fitact.batch.stated_drive import StatedDriveProblem
 from fitact.blas import limit_to_one_thread
 from fitact.compiled import available_cores, double_precision
-from fitact.data.readers.read import read_any
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
@@ -30,6 +29,7 @@ from fitact.fitting.result import Fit
 from fitact.model.skin import circuit_parameters
 from fitact.problem.build import build_problem
 from fitact.progress import track_progress
+from fitact.readers.read import read_any
 from fitact.scene.scene import Scene
 
 _GROUP_RECORDS = 256  # records that are collected for batches

@@ -1,4 +1,4 @@
-"""Reading and checking of measured data.
+"""Checked records and spectra.
 
-Reads files and arrays into checked `Record`s and `Spectrum`s, with warnings on possible errors.
+`Record`s and `Spectrum`s, with warnings on possible errors, and simulated records.
 """

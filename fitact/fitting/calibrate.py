@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitact.data.readers.read import read
 from fitact.errors import InputError
 from fitact.experiment.blind_directions import STRAY
 from fitact.fitting.result import Fit
 from fitact.likelihood.calibration import Calibration
 from fitact.model.circuit import FINGER_PARAMETERS
+from fitact.readers.read import read
 from fitact.scene.instrument_section import CalibrationSection, DummyCircuit
 from fitact.scene.prior_section import PriorSection
 from fitact.scene.scene import Scene

@@ -7,11 +7,11 @@ from typing import NamedTuple, cast
 import numpy as np
 from jaxtyping import Float
 
-from fitact.data.inspection import check_divider
 from fitact.data.plausibility import check_plausibility, insulator_voltage
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.data.spectrum import Spectrum
 from fitact.fitting.residual_statistics import is_undersampled
+from fitact.inspection.inspection import check_divider
 from fitact.instrument.classes import USUAL_STRAY
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.model.circuit import FINGER_PARAMETERS, RC

@@ -142,7 +142,8 @@ class Compression(eqx.Module):
     def _shifted_parts(self, delay: ArrayLike) -> tuple[Array, Float[Array, " ages+1"], Array]:
         """Return the delay from `origin` (s), the ends of the parts of `steps` that it passes, and minus its sign."""
         since = delay - self.origin * self.time_step
-        xp, is_later = array_module(since), since > 0.0  # with `minimum` and `maximum`, the derivative would vanish at 0
+        # with `minimum` and `maximum`, the derivative would vanish at 0
+        xp, is_later = array_module(since), since > 0.0
         ages = self.time_step * np.arange(-self.reach, self.reach + 1)
         ends = xp.clip(ages, xp.where(is_later, 0.0, since), xp.where(is_later, since, 0.0))
         return since, ends, xp.where(is_later, -1.0, 1.0)
@@ -223,7 +224,7 @@ class Compression(eqx.Module):
     def _move_origin(
         self, signal: Float[np.ndarray, "rank nodes"], tau: np.ndarray, delay: tuple[float, float]
     ) -> tuple[Float[np.ndarray, "rows nodes"], Float[np.ndarray, " rows"] | None, np.ndarray, float]:
-        """Return signals at the nodes `tau` and V, delayed to a new origin in the range `delay`, its steps and itself."""
+        """Return signals at the nodes `tau` and V, delayed to a new origin in the range `delay`; its steps; itself."""
         signal = np.pad(np.asarray(signal), ((0, self.observed.size - len(signal)), (0, 0)))
         voltage = None if self.voltage is None else np.asarray(self.voltage)
         if not len(self.steps):

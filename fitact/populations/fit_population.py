@@ -15,7 +15,6 @@ from fitact.blas import limit_to_one_thread
 from fitact.compiled import BatchEvaluator, double_precision
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
-from fitact.data.study import Nesting, Study, nest_levels
 from fitact.errors import InputError
 from fitact.fitting.fit import fit
 from fitact.fitting.result import Fit
@@ -30,6 +29,7 @@ from fitact.populations.record_files import RecordFiles
 from fitact.populations.within_finger import WithinFinger
 from fitact.prior.prior import Prior
 from fitact.progress import track_progress
+from fitact.readers.study import Nesting, Study, nest_levels
 from fitact.sampling.convergence import Convergence, diagnose_weights
 from fitact.sampling.ensemble import Target, reject_nonfinite, run_ensembles
 from fitact.sampling.importance import draw_adaptively, systematic_resample

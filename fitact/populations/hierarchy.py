@@ -13,12 +13,12 @@ from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Array, Float
 
 from fitact.compiled import jit, solve_lower
-from fitact.data.study import Nesting
 from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.populations.finger import SKIN, Finger
 from fitact.populations.nested_effects import IntegratedEffects, NestedEffects
 from fitact.populations.population_parameters import PopulationParameters, finger_loadings
 from fitact.prior.prior import Prior
+from fitact.readers.study import Nesting
 
 AREA = "contact_area"
 

@@ -13,7 +13,6 @@ from jaxtyping import Array, Float
 
 from fitact import charts, result_text, summary
 from fitact.compiled import BatchEvaluator, jit
-from fitact.data.study import Nesting
 from fitact.files import atomic_write
 from fitact.populations.contact_area import ContactAreaTest
 from fitact.populations.covariates import Covariates
@@ -41,6 +40,7 @@ from fitact.populations.population_text import (
 from fitact.populations.repeatability import LevelVariances
 from fitact.populations.sobol import SobolIndices, variance_shares
 from fitact.populations.within_finger import WithinFinger
+from fitact.readers.study import Nesting
 from fitact.sampling.convergence import Convergence
 from fitact.sampling.posterior import convert_to_arviz
 from fitact.scene.scene import Scene

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from fitact.data.readers.read import read_any
+from fitact.readers.read import read_any
 from fitact.scene.scene import Scene
 from fitact.tracking.tracked_finger import TrackedFinger
 

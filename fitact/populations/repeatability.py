@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact import summary
-from fitact.data.study import Nesting
 from fitact.populations.finger import SKIN
 from fitact.populations.hierarchy import AREA
 from fitact.populations.next_finger import NewFingerModel
 from fitact.populations.population_parameters import PopulationParameters
+from fitact.readers.study import Nesting
 
 QUANTITIES = ("Rsc", "Csc", AREA, "g", "b", "force_mean")
 

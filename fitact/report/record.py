@@ -9,8 +9,8 @@ from fitact.charts.interactive import Plot
 from fitact.charts.picture import draw_chart
 from fitact.charts.series import Series, spectrum_plot, time_plot
 from fitact.data.clipping import clipping_mask
-from fitact.data.inspection import Inspection
 from fitact.data.spectrum import Spectrum
+from fitact.inspection.inspection import Inspection
 
 
 def write_record(path: str | os.PathLike[str], inspection: Inspection) -> None:

@@ -16,14 +16,14 @@ import numpy as np
 
 from fitact.blas import limit_to_one_thread
 from fitact.compiled import double_precision
-from fitact.data.readers.spectrum import is_spectrum, read_spectrum
-from fitact.data.readers.stream import Block, stream_record
 from fitact.data.record import STATE_RATE, Record, fundamental_frequency
 from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
 from fitact.files import atomic_write, require_folder
 from fitact.problem.source import require_record
 from fitact.progress import track_progress
+from fitact.readers.spectrum import is_spectrum, read_spectrum
+from fitact.readers.stream import Block, stream_record
 from fitact.scene.scene import Scene
 from fitact.scene.sections import DriveSection
 from fitact.tracking.compressed_windows import (

@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from fitact.data.readers.read import read
 from fitact.data.record import Record
 from fitact.errors import InputError
+from fitact.readers.read import read
 from fitact.tracking.time_average import TimeAverage
 from fitact.tracking.track import Track
 

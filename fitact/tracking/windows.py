@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from fitact.data.readers.stream import Block
 from fitact.errors import InputError
+from fitact.readers.stream import Block
 
 
 class Window(NamedTuple):

@@ -19,7 +19,7 @@ import pytest
 import fitact
 import fitact.batch.campaign as module
 from fitact.batch.campaign import JOURNAL, Journal, Task
-from fitact.data.readers.read import write_csv
+from fitact.readers.read import write_csv
 from tests.conftest import square_record
 
 psutil = pytest.importorskip("psutil")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import fitact
-from fitact.data.readers.read import write_csv
 from fitact.data.record import white_noise_sd
+from fitact.readers.read import write_csv
 
 Rows = list[list[str]]
 

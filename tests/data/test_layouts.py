@@ -12,8 +12,8 @@ import scipy.io
 import fitact
 from fitact.cli import app
 from fitact.data.clipping import clipping_mask
-from fitact.data.readers.read import read_capture
-from fitact.data.readers.stream import stream_record
+from fitact.readers.read import read_capture
+from fitact.readers.stream import stream_record
 from tests.layouts.__main__ import PAGE, render_table
 from tests.layouts.layout import COUNT, REAL, SCOPE, STEP, TIME, VSC, Layout, V, rows
 from tests.layouts.records import LVM, PLAIN, RECORDS, clocks, with_clock

@@ -20,7 +20,7 @@ import scipy.io
 
 import fitact
 from fitact.data import inspection, record, spectrum
-from fitact.data.readers import (
+from fitact.readers import (
     binary,
     capture,
     extras,
@@ -34,7 +34,7 @@ from fitact.data.readers import (
     stream,
     text,
 )
-from fitact.data.readers import spectrum as spectrum_files
+from fitact.readers import spectrum as spectrum_files
 from tests.data.test_bad_input import KINDS, make_file
 from tests.data.test_layouts import REFUSED as REFUSED_LAYOUTS
 from tests.data.test_scope_files import SKIN

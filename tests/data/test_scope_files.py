@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import fitact
-from fitact.data.readers.matlab import read_mat
-from fitact.data.readers.read import read_capture
+from fitact.readers.matlab import read_mat
+from fitact.readers.read import read_capture
 from tests.layouts.layout import SCOPE, STEP, TIME, VSC, V
 
 SKIN = {"V": "CH1", "Vsc": "CH2"}
@@ -92,7 +92,7 @@ def test_many_blocks_and_gzip(tmp_path: Path, monkeypatch, finger_path: Path):
     plain = fitact.read(finger_path)
     path = tmp_path / "record.csv.gz"
     path.write_bytes(gzip.compress(finger_path.read_bytes()))
-    monkeypatch.setattr("fitact.data.readers.text.BLOCK_BYTES", 1009)
+    monkeypatch.setattr("fitact.readers.text.BLOCK_BYTES", 1009)
     assert fitact.read(path).fingerprint == plain.fingerprint
     lines = finger_path.read_text().splitlines()
     lines[3000] = lines[3000].replace(",", ",x", 1)

@@ -9,7 +9,7 @@ import pytest
 import fitact
 from fitact.cli import app
 from fitact.data.kramers_kronig import check_kramers_kronig
-from fitact.data.readers.spectrum import is_spectrum
+from fitact.readers.spectrum import is_spectrum
 from tests.layouts.layout import REAL
 from tests.layouts.spectra import FILES, FREQUENCY, GAINS, SHUNT, TRUTH, Z, impedance, write, write_gain
 

@@ -7,7 +7,7 @@ import pytest
 
 import fitact
 from fitact.cli import internal
-from fitact.data.readers.read import read_capture
+from fitact.readers.read import read_capture
 from tests.layouts.files import raw
 
 STEP, COUNT = 20e-6, 200

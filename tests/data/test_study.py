@@ -12,7 +12,7 @@ import pytest
 
 import fitact
 from fitact.cli import options
-from fitact.data.study import LEVELS, covariate_level, is_study, nest_levels
+from fitact.readers.study import LEVELS, covariate_level, is_study, nest_levels
 
 NAMES = ("a.csv", "b.csv", "c.csv", "d.csv")
 

@@ -23,7 +23,6 @@ from fitact.charts import draw_drive_design
 from fitact.charts.figure import write_figure
 from fitact.cli import run_command
 from fitact.cli.app import app
-from fitact.data.study import nest_levels
 from fitact.design.drive import _DriveEvaluator
 from fitact.design.drive_option import DriveOption, quantile, quantile_error
 from fitact.design.drive_people import FingerSample
@@ -31,6 +30,7 @@ from fitact.model.steady_cycle import period_quantities
 from fitact.populations import population_draws
 from fitact.populations.population_draws import PopulationDraws
 from fitact.populations.population_parameters import PopulationParameters
+from fitact.readers.study import nest_levels
 
 EPS0, AREA, TI, TSC = 8.85e-12, 1e-4, 1e-6, 200e-6
 R, C, CI, F, RISE = 160e3, 22e-9, 1.35e-9, 100.0, 50e-6

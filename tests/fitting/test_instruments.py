@@ -10,7 +10,7 @@ import pytest
 import scipy.stats
 
 import fitact
-from fitact.data.readers.read import write_csv
+from fitact.readers.read import write_csv
 from fitact.result_text import budget_sentence, budget_text
 from tests import session_calibration as session
 

@@ -23,7 +23,7 @@ def test_a_cubic_and_edges_stay_as_they_are():
 
 @pytest.mark.parametrize(("period", "level", "slope"), [(1600, 0.2, 0.04), (500, 0.3, 0.08), (160, 0.6, 0.2)])
 def test_noise_and_its_slope_are_removed(period: int, level: float, slope: float):
-    """Of white noise, differences have 1.41 sd; a parabola over nine samples leaves 0.51 and 0.28 (SciPy)."""
+    """White noise has differences of 1.41 sd; a parabola over nine samples leaves 0.51 and 0.28 (SciPy)."""
     noise = np.random.default_rng(0).standard_normal(16_000)
     taps = scipy.signal.savgol_coeffs(9, 2)
     assert np.linalg.norm(taps) == pytest.approx(0.505, abs=1e-3)
@@ -90,7 +90,7 @@ def test_a_delay_is_not_drawn_between_two_samples(skew: int, noise_V: float):
 @pytest.mark.parametrize("bits", [9, 12])
 @pytest.mark.parametrize("waveform", ["triangle", "sine"])
 def test_a_skew_that_nobody_stated_is_in_the_uncertainty(waveform: str, bits: int):
-    """From none to half a step: with a fixed delay, b of the triangle was off by 8 to 27 u, and by 7 u in 9 bits.
+    """Skews from none to half a step: with a fixed delay, b of the triangle was off by 8 to 27 u, and by 7 u in 9 bits.
 
     One sine does not tell a delay from b, which then is as uncertain as a delay of a step makes it.
     """

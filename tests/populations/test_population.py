@@ -21,7 +21,6 @@ import scipy.stats
 from arviz_stats.base import array_stats
 
 import fitact
-from fitact.data.study import Nesting, nest_levels
 from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.populations.contact_area import ContactAreaTest
 from fitact.populations.covariates import Covariates, read_covariates
@@ -34,6 +33,7 @@ from fitact.populations.population import evaluate_parameters
 from fitact.populations.population_parameters import PopulationParameters
 from fitact.populations.sobol import Surrogate, sobol_indices, variance_shares
 from fitact.prior.prior import Prior
+from fitact.readers.study import Nesting, nest_levels
 from tests.population_calibration import FREQUENCY, simulate, steady, vsc, wave
 
 NUTS_CHAINS, NUTS_STEPS = 4, 3000

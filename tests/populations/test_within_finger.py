@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import fitact
-from fitact.data.readers.read import write_csv
 from fitact.populations.finger import Finger
 from fitact.populations.next_finger import redrawn_variance_fraction
 from fitact.populations.record_files import RecordFiles
 from fitact.populations.within_finger import PooledVariance, WithinFinger, pool_variances
+from fitact.readers.read import write_csv
 from tests.within_calibration import CHANGE, Law, complete_places, records_of_changing_fingers
 
 FINGERS, WINDOWS = 8, 40

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fitact
-from fitact.data.readers.read import write_csv
+from fitact.readers.read import write_csv
 from fitact.tracking.random_walk import WindowInformation
 from fitact.tracking.time_average import TimeAverage, average_windows
 from fitact.tracking.tracked_finger import SUMMARY, WINDOW, TrackedFinger

@@ -210,7 +210,7 @@ def test_lost_samples_are_bridged_and_a_jump_is_found():
     channels["Vsc"][30_000:36_000] = np.nan  # lost by one channel
     keep = np.ones(record.time.size, bool)
     keep[50_000:60_000] = False  # lost by all, with their times
-    blocks = [fitact.data.readers.stream.Block(record.time[keep], {n: v[keep] for n, v in channels.items()}, 0.0)]
+    blocks = [fitact.readers.stream.Block(record.time[keep], {n: v[keep] for n, v in channels.items()}, 0.0)]
     track = track_record.track_blocks(iter(blocks), "record", 0.0, SCENE)
     lost = ~track.reliable & (track.time < 1.0)  # the window with the jump is none of either state
     assert lost.any()

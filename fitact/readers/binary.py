@@ -16,14 +16,14 @@ from typing import Any, Literal
 import lazy_loader
 import numpy as np
 
-from fitact.data.readers import layouts
-from fitact.data.readers.capture import FULL_SCALE, Capture, FileChannel, Pick
-from fitact.data.readers.extras import import_extra
-from fitact.data.readers.matlab import read_mat
-from fitact.data.readers.segments import choose_segment, select_segment
-from fitact.data.readers.spice import is_spice, read_spice
 from fitact.errors import RATE_OPTION, InputError
 from fitact.files import read_head
+from fitact.readers import layouts
+from fitact.readers.capture import FULL_SCALE, Capture, FileChannel, Pick
+from fitact.readers.extras import import_extra
+from fitact.readers.matlab import read_mat
+from fitact.readers.segments import choose_segment, select_segment
+from fitact.readers.spice import is_spice, read_spice
 
 h5py, scipy = lazy_loader.load("h5py"), lazy_loader.load("scipy")
 

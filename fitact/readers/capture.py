@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable, Mapping
 import numpy as np
 from jaxtyping import Float
 
-from fitact.data.readers.layouts import normalize_channel, parse_unit
 from fitact.data.record import CHANNEL_UNITS, Record, is_rounded_grid
 from fitact.errors import RATE_OPTION, InputError, channel_option, scale_option
+from fitact.readers.layouts import normalize_channel, parse_unit
 from fitact.units import format_engineering
 
 FULL_SCALE = "full scale"  # unit of a file whose values are parts of the range of its converter

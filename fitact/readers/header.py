@@ -9,8 +9,8 @@ import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from fitact.data.readers import layouts
 from fitact.errors import RATE_OPTION, InputError
+from fitact.readers import layouts
 
 _EXAMPLE = "time_s,V_V,Vsc_V,I_A"
 MINUS = "\N{MINUS SIGN}"  # as typeset, in place of the hyphen

@@ -17,13 +17,13 @@ from typing import IO, Any, NoReturn, cast
 import numpy as np
 from jaxtyping import Float
 
-from fitact.data.readers import layouts
-from fitact.data.readers.capture import Capture, FileChannel, Pick
-from fitact.data.readers.header import MINUS, Column, Header, parse_number, read_header, split_cells
-from fitact.data.readers.segments import SEGMENT, SegmentsError, choose_segment, find_parts, select_segment
 from fitact.errors import RATE_OPTION, SEGMENT_OPTION, InputError
 from fitact.files import read_error
 from fitact.progress import track_progress
+from fitact.readers import layouts
+from fitact.readers.capture import Capture, FileChannel, Pick
+from fitact.readers.header import MINUS, Column, Header, parse_number, read_header, split_cells
+from fitact.readers.segments import SEGMENT, SegmentsError, choose_segment, find_parts, select_segment
 from fitact.units import format_engineering
 
 PADDING = b"\x00\x1a"  # that some programs write after the text

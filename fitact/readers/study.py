@@ -13,9 +13,9 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from jaxtyping import Int
 
-from fitact.data.readers.header import parse_number
 from fitact.errors import InputError
 from fitact.files import read_error, read_head
+from fitact.readers.header import parse_number
 from fitact.tables import Display, join_lines
 
 LEVELS = ("person", "finger", "session", "repetition")  # a unit of each is one within its unit of the level before

@@ -9,10 +9,10 @@ from typing import IO
 import numpy as np
 from jaxtyping import Float
 
-from fitact.data.readers.capture import Capture
-from fitact.data.readers.spreadsheet import is_spreadsheet, read_sheets
 from fitact.data.record import MINIMUM_SAMPLES
 from fitact.errors import SEGMENT_OPTION, InputError
+from fitact.readers.capture import Capture
+from fitact.readers.spreadsheet import is_spreadsheet, read_sheets
 
 SEGMENT = re.compile(r"Step Information:|Channels[\t,;]|\*\*\*End_of_Header")  # of LTspice, LabVIEW
 

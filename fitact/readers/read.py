@@ -8,8 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fitact.data.readers.binary import is_known_binary, read_binary
-from fitact.data.readers.capture import (
+from fitact.data.record import CHANNEL_UNITS, Record
+from fitact.data.spectrum import Spectrum
+from fitact.errors import InputError, channel_option
+from fitact.files import atomic_write, read_head
+from fitact.readers.binary import is_known_binary, read_binary
+from fitact.readers.capture import (
     Capture,
     Pick,
     find_channel,
@@ -17,15 +21,11 @@ from fitact.data.readers.capture import (
     resolve_channels,
     to_record,
 )
-from fitact.data.readers.layouts import is_same_grid
-from fitact.data.readers.spectrum import is_spectrum, read_spectrum
-from fitact.data.readers.spice import is_ac_analysis
-from fitact.data.readers.spreadsheet import is_spreadsheet
-from fitact.data.readers.text import PADDING, is_binary, read_text
-from fitact.data.record import CHANNEL_UNITS, Record
-from fitact.data.spectrum import Spectrum
-from fitact.errors import InputError, channel_option
-from fitact.files import atomic_write, read_head
+from fitact.readers.layouts import is_same_grid
+from fitact.readers.spectrum import is_spectrum, read_spectrum
+from fitact.readers.spice import is_ac_analysis
+from fitact.readers.spreadsheet import is_spreadsheet
+from fitact.readers.text import PADDING, is_binary, read_text
 
 if TYPE_CHECKING:
     from fitact.scene.scene import Scene  # would import JAX

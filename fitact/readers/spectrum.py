@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from fitact.data.readers.header import parse_number, split_cells
-from fitact.data.readers.segments import select_segment
-from fitact.data.readers.spice import find_ac_analyses, find_response, is_ac_analysis, read_ac_analyses
-from fitact.data.readers.spreadsheet import is_spreadsheet, read_sheets
 from fitact.data.spectrum import MINIMUM_POINTS, ChannelName, Spectrum
 from fitact.errors import InputError
 from fitact.files import read_head
+from fitact.readers.header import parse_number, split_cells
+from fitact.readers.segments import select_segment
+from fitact.readers.spice import find_ac_analyses, find_response, is_ac_analysis, read_ac_analyses
+from fitact.readers.spreadsheet import is_spreadsheet, read_sheets
 from fitact.units import PREFIX_FACTORS, format_engineering
 
 _DELIMITERS = ("\t", ";", ",", " ")

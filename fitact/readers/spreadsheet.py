@@ -7,10 +7,10 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-from fitact.data.readers.extras import import_extra
 from fitact.data.spectrum import MINIMUM_POINTS
 from fitact.errors import InputError
 from fitact.files import read_head
+from fitact.readers.extras import import_extra
 
 _OLD_EXCEL = b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
 

@@ -10,11 +10,11 @@ from typing import IO, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from fitact.data.readers.binary import is_known_binary
-from fitact.data.readers.capture import channel_arrays, resolve_channels
-from fitact.data.readers.read import read
-from fitact.data.readers.text import BLOCK_BYTES, is_binary, read_sidecar, stream_text
 from fitact.files import read_error, read_head
+from fitact.readers.binary import is_known_binary
+from fitact.readers.capture import channel_arrays, resolve_channels
+from fitact.readers.read import read
+from fitact.readers.text import BLOCK_BYTES, is_binary, read_sidecar, stream_text
 
 
 class Block(NamedTuple):

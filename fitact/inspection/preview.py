@@ -11,13 +11,13 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from fitact.data.readers.capture import FULL_SCALE, Capture, FileChannel
-from fitact.data.readers.read import read_capture
-from fitact.data.readers.spectrum import is_swept
-from fitact.data.readers.text import is_binary
 from fitact.data.record import CHANNEL_UNITS, MINIMUM_SAMPLES, OVERFLOW
 from fitact.errors import InputError
 from fitact.files import read_head
+from fitact.readers.capture import FULL_SCALE, Capture, FileChannel
+from fitact.readers.read import read_capture
+from fitact.readers.spectrum import is_swept
+from fitact.readers.text import is_binary
 from fitact.tables import align_table
 
 

@@ -10,9 +10,6 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.data.clipping import clipping_mask, has_flat_levels
-from fitact.data.preview import describe_rows, guess_command
-from fitact.data.readers.capture import Capture, FileChannel, has_standard_names, replace_rounded_times, to_record
-from fitact.data.readers.read import merge_other_files, read_capture
 from fitact.data.record import (
     CHANNEL_UNITS,
     LARGEST_VALUES,
@@ -26,6 +23,9 @@ from fitact.data.record import (
     white_noise_sd,
 )
 from fitact.errors import InputError
+from fitact.inspection.preview import describe_rows, guess_command
+from fitact.readers.capture import Capture, FileChannel, has_standard_names, replace_rounded_times, to_record
+from fitact.readers.read import merge_other_files, read_capture
 from fitact.tables import join_lines
 from fitact.units import format_engineering
 

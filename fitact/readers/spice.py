@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fitact.data.readers.capture import Capture, FileChannel, Pick
-from fitact.data.readers.header import parse_number
-from fitact.data.readers.segments import select_segment, split_time, take_part
 from fitact.data.spectrum import ChannelName
 from fitact.errors import InputError
 from fitact.files import read_head
+from fitact.readers.capture import Capture, FileChannel, Pick
+from fitact.readers.header import parse_number
+from fitact.readers.segments import select_segment, split_time, take_part
 
 _BEGIN = re.compile(rb"Title:[^\n]*\nDate:[^\n]*\n(?:[^\n]*\n)?Plotname:")
 _WIDE = b"T\0i\0t\0l\0e\0:\0"  # UTF-16
