@@ -1,12 +1,8 @@
 from .batch.campaign import run_campaign
 from .batch.fit_many import Fits, fit_many
 from .batch.sample_many import sample_many
-from .data.inspection import Inspection, inspect
-from .data.readers.read import read
-from .data.readers.spectrum import read_spectra, read_spectrum
 from .data.record import Record
 from .data.spectrum import Spectrum
-from .data.study import Study
 from .design.drive import design_drive
 from .design.drive_design import DriveDesign
 from .design.measurement import MeasurementDesign, design_measurement
@@ -14,6 +10,7 @@ from .errors import InputError
 from .fitting.fit import fit
 from .fitting.outcome import RESULTS
 from .fitting.result import Fit
+from .inspection.inspection import Inspection, inspect
 from .model.chirp import Chirp
 from .model.circuit import DirectGround, FinalCircuit, NaturalGround, Probe
 from .model.drive import Burst, Multitone, Polyline, Sampled, Sine, Square, Trapezoid, Triangle
@@ -28,6 +25,9 @@ from .populations.fit_population import population
 from .populations.population import Population
 from .prior.distributions import LogNormal, LogUniform, TruncatedLogNormal, Uniform
 from .prior.prior import Prior
+from .readers.read import read
+from .readers.spectrum import read_spectra, read_spectrum
+from .readers.study import Study
 from .sampling.ensemble import sample
 from .sampling.posterior import Posterior
 from .scene.scene import Scene

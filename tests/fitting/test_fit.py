@@ -209,7 +209,8 @@ def test_misfit_is_named(finger_path, name: str):
     fit = fitact.fit(misfits(fitact.read(finger_path))[name])
     assert fit.result == "misfit"
     assert not fit.trusted
-    assert "Poor fit" in str(fit)
+    assert "Unreliable (misfit)" in str(fit)
+    assert "Poor fit" in fit.message
 
 
 @pytest.mark.slow
