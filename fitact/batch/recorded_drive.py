@@ -150,7 +150,7 @@ class RecordedDriveProblem(BatchProblem):
         weight = self.derive.weight[: self.evaluated.stop - self.evaluated.start]
         contact = weight, self.derive.coefficient, self.derive.normal_force
         square, tests, logs, gradients = _evaluate_records(
-            self.shared, self.phases, self.evaluated.start, contact, whiteness, tables.b, optimum, V, Vsc, noise_V
+            self.shared, self.phases, self.evaluated.start, contact, whiteness, tables.b, optimum, V, Vsc, tables.smooth
         )
         expected = np.hypot(screened.noise, optimum.gain * noise_V)
         figures = self._figures(V, driven.noise, expected, square, tests, inputs.linear_sd, optimum.gain)
@@ -293,13 +293,13 @@ def _evaluate_records(
     optima: ModelCoefficients,
     V: Float[Array, "records samples"],
     Vsc: Float[Array, "records samples"],
-    noise: Float[Array, " records"],
+    smooth: Float[Array, "records samples"],
 ) -> tuple[Array, ResidualTestStatistics | None, Array, Array]:
     """Return the residual sums of squares, statistics of the residual tests, and the moments of `_derive_record`."""
 
     def evaluate_record(record: tuple[Array, ModelCoefficients, Array, Array, Array]) -> tuple[Array, Array, Array]:
-        center, optimum, v, vsc, sd = record
-        own = shared.filter_drive(v, vsc, table_nodes(center), sd)
+        center, optimum, v, vsc, smooth_v = record
+        own = shared.filter_drive(v, vsc, table_nodes(center), smooth_v)
         shared_part, own_part = jnp.split(optimum.fitted, [shared.size])
         model = shared_part @ shared.fitted_functions + sum(c * row for c, row in zip(own_part, own, strict=False))
         # the voltage is not delayed, so that the steps of the drive have no part in it
@@ -307,7 +307,7 @@ def _evaluate_records(
         forces = _derive_record(own[:TABLE_NODES, times], shared.functions[:, times], contact, optimum)
         return shared.select_fitted(own[-1] - model), *forces
 
-    residuals, logs, gradients = map_blocks(evaluate_record, (tau, optima, V, Vsc, noise), RECORD_BLOCK)
+    residuals, logs, gradients = map_blocks(evaluate_record, (tau, optima, V, Vsc, smooth), RECORD_BLOCK)
     test = functools.partial(ResidualTestStatistics.from_residuals, phase_bins=phases)
     tests = map_blocks(test, residuals.astype(jnp.float32), SAMPLE_BLOCK) if whiteness else None
     return sum_rows(residuals * residuals), tests, logs, gradients
@@ -359,7 +359,7 @@ def _tabulate_responses(
     def tabulate_record(record: tuple[Array, Array]) -> ResponseTable:
         center, v = record
         nodes = table_nodes(jnp.exp(center))
-        own = shared.filter_drive(v, jnp.zeros_like(v), nodes)[:TABLE_NODES]
+        own = shared.filter_drive(v, jnp.zeros_like(v), nodes, v)[:TABLE_NODES]
         decays = (shared.decay @ shared.decay_polynomials(nodes)).T @ shared.functions
         signal, decay = (
             jnp.pad(series.T @ each[:, begin : begin + count], ((0, 0), (0, max(begin + count - v.size, 0)))).T

@@ -13,7 +13,6 @@ from typing import NamedTuple, Self
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from fitact.batch.gauss_newton import decompose_qr, substitute_back
@@ -100,13 +99,13 @@ class SharedFunctions(NamedTuple):
         V: Float[Array, " samples"],
         Vsc: Float[Array, " samples"],
         tau: Float[Array, " nodes"],
-        noise: ArrayLike = 0.0,
+        smooth: Float[Array, " samples"],
     ) -> Float[Array, "own samples"]:
         """Return the functions of a record: the responses to V at the nodes, the `steps`, and last Vsc itself.
 
-        They are those at the times of the drive, i.e. without the delay `origin`. `noise` is the sd of that of V.
+        They are those at the times of the drive, i.e. without the delay `origin`. `smooth` is V as a delay shifts it.
         """
-        x, samples, smooth = self.time_step / tau, V.size, smooth_drive(V, noise)
+        x, samples = self.time_step / tau, V.size
         rises = jnp.diff(jnp.pad(smooth, (AGES + 1, AGES), mode="edge")) / self.time_step
         steps = [*(rises[AGES - age : AGES - age + samples] for age in range(-AGES, AGES)), V - smooth]
         # the first sample is a jump from 0
@@ -129,6 +128,7 @@ class Tables(NamedTuple):
     Attributes:
         g, b: estimates of the parameters, around which each table lies (b in s).
         is_possible: whether they could be estimated.
+        smooth: V as a delay shifts it (`smooth_drive`).
         decay: decays of an unknown charge at the nodes, in the shared functions.
         coordinates: orthogonal coordinates of the functions, with the inner products over the fitted samples.
     """
@@ -137,6 +137,7 @@ class Tables(NamedTuple):
     g: Float[np.ndarray, " records"]
     b: Float[np.ndarray, " records"]
     is_possible: Bool[np.ndarray, " records"]
+    smooth: Float[np.ndarray, "records samples"]
     decay: Float[np.ndarray, "records shared nodes"]
     coordinates: Float[np.ndarray, "records rows functions"]
 
@@ -149,12 +150,12 @@ class Tables(NamedTuple):
         noise: Float[np.ndarray, " records"],
     ) -> Self:
         """Tabulate the responses of each record; `noise` is the sd of the white noise of V."""
-        g, b, is_possible, decay, across, products = _multiply_functions(shared, V, Vsc, noise)
+        g, b, is_possible, smooth, decay, across, products = _multiply_functions(shared, V, Vsc, noise)
         scale = np.sqrt(np.einsum("rii->ri", products))
         rest, *_ = root_products(products - np.swapaxes(across, 1, 2) @ across, scale)
         own = np.concatenate([across, rest], axis=1)
         first = np.broadcast_to(np.eye(own.shape[1], shared.size), (len(V), own.shape[1], shared.size))
-        return cls(shared, g, b, is_possible, decay, np.concatenate([first, own], axis=2))
+        return cls(shared, g, b, is_possible, smooth, decay, np.concatenate([first, own], axis=2))
 
     def fields(self, *, in_functions: bool = False) -> dict[str, np.ndarray]:
         """Return the fields of `Compression` that differ between records, by name.
@@ -199,15 +200,15 @@ def _multiply_functions(
     Vsc: Float[Array, "records samples"],
     noise: Float[Array, " records"],
 ) -> tuple[Array, ...]:
-    """Return estimates and decays as in `Tables`, and the inner products of functions with the shared ones and own."""
+    """Return what `Tables` holds of each record, and the inner products of functions with the shared ones and own."""
 
     def multiply_record(record: tuple[Array, Array, Array]) -> tuple[Array, ...]:
         v, vsc, sd = record
         g, b, is_possible = _estimate_start(shared, v, vsc)
         nodes = table_nodes(b)
-        decay = shared.decay @ shared.decay_polynomials(nodes)
-        used = shared.is_fitted * shared.filter_drive(v, vsc, nodes, sd)
-        return g, b, is_possible, decay, shared.fitted_functions @ used.T, used @ used.T
+        smooth, decay = smooth_drive(v, sd), shared.decay @ shared.decay_polynomials(nodes)
+        used = shared.is_fitted * shared.filter_drive(v, vsc, nodes, smooth)
+        return g, b, is_possible, smooth, decay, shared.fitted_functions @ used.T, used @ used.T
 
     return map_blocks(multiply_record, (V, Vsc, noise), RECORD_BLOCK)
 

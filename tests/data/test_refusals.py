@@ -19,7 +19,8 @@ import pytest
 import scipy.io
 
 import fitact
-from fitact.data import inspection, record, spectrum
+from fitact.data import record, spectrum
+from fitact.inspection import inspection
 from fitact.readers import (
     binary,
     capture,
