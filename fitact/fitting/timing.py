@@ -100,7 +100,7 @@ def shift_whole_steps(
         place = likelihood.names.index(channel.qualified_name("delay"))
         before, step = float(channel.timing.shift / channel.timing.step), float(channel.timing.step)
         steps = round(before + float(theta[place])) - round(before)
-        if channel.samples.charges is not None or steps == 0 or abs(theta[place]) < 4.0 * sd[place]:
+        if channel.samples.charges is not None or steps == 0 or abs(theta[place]) < max(0.75, 4.0 * sd[place]):
             continue
         late = channel.without_compression().replace_timing(shift=channel.timing.shift + steps * step)
         late = dataclasses.replace(late, observable=late.electrical.delay_noise(steps))
