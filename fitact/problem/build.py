@@ -261,11 +261,12 @@ def _build_channel(
     weight = None if weight is None else pad_weight(weight)
     colour, noise = _noise(record, channel, scene)
     # edges of a shifted drive are known only to within a step, which affects g; samples of I there are excluded
-    free = ("delay",) if channel == "Vsc" and (choice.shift != 0.0 or _skew_sd(record, scene, choice) > 0.0) else ()
+    skew_sd = _skew_sd(record, scene, choice, template) if channel == "Vsc" else 0.0
+    free = ("delay",) if channel == "Vsc" and (choice.shift != 0.0 or skew_sd > 0.0) else ()
     has_stray = channel == "I" and (scene.stray_capacitance() > 0.0 or STRAY in bare.prior.names)
     smooth = _smooth_drive(record) if channel == "Vsc" and _can_smooth(choice, template) else None
     shift, step = (np.asarray(each, dtype=float) for each in (choice.shift, record.time_step))
-    timing = DriveTiming(shift, np.zeros(()), step, _timing_sd(record, choice, scene, channel), free)
+    timing = DriveTiming(shift, np.zeros(()), step, _timing_sd(record, choice, channel, skew_sd), free)
     linear_sd, noise_floor = _prior_of_nuisances(record, choice, scene, channel, len(taus) * choice.unknown_charge)
     likelihood = ChannelLikelihood(
         samples=PaddedSamples(
@@ -426,14 +427,15 @@ def _noise(record: Record, channel: str, scene: Scene) -> tuple[Autoregression |
     return estimate_quiet_noise(record, channel, quiet)
 
 
-def _skew_sd(record: Record, scene: Scene, choice: DriveModel, min_part: float = 0.01) -> float:
+def _skew_sd(record: Record, scene: Scene, choice: DriveModel, template: Circuit, min_part: float = 0.01) -> float:
     """Return the prior sd of the delay of Vsc against V in time steps; 0 if it is below `min_part` of a step.
 
     It is one step if V was recorded and nobody stated with what: converters take channels in turn, and probes delay
-    them.
+    them. Skins that depend on the frequency, which have no table with a delay, get one by the BIC only.
     """
-    if choice.name == "measured" and not (scene.instrument.pieces("V") or scene.instrument.pieces("Vsc")):
-        return 1.0
+    stated = scene.instrument.pieces("V") or scene.instrument.pieces("Vsc")
+    if choice.name == "measured" and not stated:
+        return 0.0 if isinstance(template, WithSkin) else 1.0
     limit = scene.skew_limit("Vsc", record.time_step) / record.time_step
     return limit / math.sqrt(3.0) if limit > min_part else 0.0
 
@@ -451,15 +453,15 @@ def _prior_of_nuisances(
     return linear_sd, np.asarray(max(MIN_RELATIVE_NOISE * peak_to_peak, rounding_noise_sd(record[channel])))
 
 
-def _timing_sd(record: Record, choice: DriveModel, scene: Scene, channel: str) -> Float[np.ndarray, "2"]:
-    """Return the prior sds of delay and clock, in their units."""
+def _timing_sd(record: Record, choice: DriveModel, channel: str, skew_sd: float) -> Float[np.ndarray, "2"]:
+    """Return the prior sds of delay and clock, in their units; `skew_sd` is that of a skew, if there is one."""
     # in time steps at the ends of the record; the frequency of the drive is known to one or two steps
     clock_sd = 5.0
     if channel == "Vsc" and choice.name != "measured":
         clock_sd = max(clock_sd, frequency_error(record, choice.name) * record.time.size)
     # samples near an ideal edge determine the delay only to within one step, in the middle of which it starts
     delay_sd = math.sqrt(1.0 / 12.0) if has_ideal_edges(choice.drive) else 5.0
-    if skew_sd := _skew_sd(record, scene, choice):
+    if skew_sd:
         delay_sd = math.hypot(delay_sd if choice.shift != 0.0 else 0.0, skew_sd)
     return np.array([delay_sd, clock_sd])
 
