@@ -67,21 +67,24 @@ class RecordInputs(NamedTuple):
         linear_sd: see `ChannelLikelihood`.
         noise_floor: lower bound of sigma.
         gain_sd: prior sd of log(gain), if a gain is free.
+        noise_gain: see `ElectricalSignal`, if V was recorded.
     """
 
     table: dict[str, Array]
     linear_sd: Float[Array, "*records nuisances"]
     noise_floor: Float[Array, "*records"]
     gain_sd: Float[Array, "*records"] | None = None
+    noise_gain: Float[Array, "*records"] | None = None
 
     def model(self, likelihood: Likelihood) -> Likelihood:
         """Return the likelihood of the record."""
         channel = likelihood.channels[0]
         assert isinstance(channel.compression, Compression)
         table = dataclasses.replace(channel.compression, **self.table)
-        likelihood = likelihood.replace_channel(
-            0, dataclasses.replace(channel, compression=table, linear_sd=self.linear_sd)
-        )
+        channel = dataclasses.replace(channel, compression=table, linear_sd=self.linear_sd)
+        if self.noise_gain is not None:
+            channel = channel.replace_observable(noise_gain=self.noise_gain)
+        likelihood = likelihood.replace_channel(0, channel)
         if self.gain_sd is None:
             return likelihood
         return eqx.tree_at(lambda each: each.prior["gain"].spread, likelihood, self.gain_sd)

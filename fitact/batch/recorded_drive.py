@@ -217,7 +217,7 @@ class RecordedDriveProblem(BatchProblem):
         fields, clock = self._select(tables.fields()), np.zeros(tables.coordinates.shape[1])
         tolerance = self.settings.first_tolerance
         while True:
-            inputs = RecordInputs(fields, linear_sd, floor, gain_sd)
+            inputs = RecordInputs(fields, linear_sd, floor, gain_sd, tables.g)
             optima = find_optima(self.likelihood, self.settings, clock, np.asarray(tolerance), inputs, start, noise)
             gains, linear_sd = self.bic_decreases(optima.r_squared), linear_sd.copy()
             largest = np.max(gains, axis=1)

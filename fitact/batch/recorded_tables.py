@@ -181,7 +181,6 @@ class Tables(NamedTuple):
             "observed": found["observed"][..., 0],
             "observed_slope": zeros,
             "steps": steps,
-            "noise_gain": self.g,
         }
 
 

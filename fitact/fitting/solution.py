@@ -51,10 +51,11 @@ def solve_problem(
             influences = [jacobian @ end[2] for jacobian in end[0].jacobian]
             likelihood, change = update_weights(likelihood, theta, problem.sources, influences)
             is_settled = change <= 1e-3
-        moved_likelihood, theta = shift_whole_steps(likelihood, theta, np.linalg.norm(end[2][places], axis=1))
-        is_settled, likelihood = is_settled and moved_likelihood is likelihood, moved_likelihood
+        sd = np.linalg.norm(end[2][places], axis=1)
+        shifted, theta = shift_whole_steps(likelihood, theta, sd)
+        is_settled, likelihood = is_settled and shifted is likelihood, shifted
         if has_rows:
-            moved = np.abs(theta - before) / np.linalg.norm(end[2][places], axis=1)
+            moved = np.abs(theta - before) / sd
             skew = np.max(np.abs(theta), where=likelihood.follows_rows, initial=0.0)
             others = np.max(moved, where=~likelihood.follows_rows, initial=0.0)
             is_still = (skew <= max_skew and np.max(moved) <= max_change) or (skew <= 0.5 and others <= 0.05)

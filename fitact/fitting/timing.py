@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -75,12 +76,10 @@ def start_delays(likelihood: Likelihood, theta: Float[np.ndarray, " parameters"]
 
     Each sample that such a jump passes is a minimum.
     """
-    for i, channel in enumerate(likelihood.channels):
-        if "delay" not in channel.timing.free or not channel.observable.follows_samples:
-            continue
+    for i, channel in _delayed_channels(likelihood):
         drive = channel.electrical.drive
         assert isinstance(drive, Sampled)
-        if channel.samples.charges is None and has_unresolved_edge(np.asarray(drive.samples)):
+        if has_unresolved_edge(np.asarray(drive.samples)):
             at_theta = likelihood.channel_inputs(theta, i), likelihood.evaluate_circuit(theta)
             likelihood = likelihood.replace_channel(i, free_timing(channel, *at_theta, "delay"))
     return likelihood
@@ -94,18 +93,23 @@ def shift_whole_steps(
     `sd` is that of theta. The likelihood is the same if there are none.
     """
     theta = theta.copy()
-    for i, channel in enumerate(likelihood.channels):
-        if "delay" not in channel.timing.free or not channel.observable.follows_samples:
-            continue
-        place = likelihood.names.index(channel.qualified_name("delay"))
-        before, step = float(channel.timing.shift / channel.timing.step), float(channel.timing.step)
+    for i, channel in _delayed_channels(likelihood):
+        place, timing = likelihood.names.index(channel.qualified_name("delay")), channel.timing
+        before = float(timing.shift / timing.step)
         steps = round(before + float(theta[place])) - round(before)
-        if channel.samples.charges is not None or steps == 0 or abs(theta[place]) < max(0.75, 4.0 * sd[place]):
+        if steps == 0 or abs(theta[place]) < max(0.75, 4.0 * sd[place]):
             continue
-        late = channel.without_compression().replace_timing(shift=channel.timing.shift + steps * step)
+        late = channel.without_compression().replace_timing(shift=timing.shift + steps * timing.step)
         late = dataclasses.replace(late, observable=late.electrical.delay_noise(steps))
         likelihood, theta[place] = likelihood.replace_channel(i, late), theta[place] - steps
     return likelihood, theta
+
+
+def _delayed_channels(likelihood: Likelihood) -> Iterator[tuple[int, ChannelLikelihood]]:
+    """Yield the channels with a free delay against the samples of a recorded drive; rows of charge follow it."""
+    for i, channel in enumerate(likelihood.channels):
+        if "delay" in channel.timing.free and channel.observable.follows_samples and channel.samples.charges is None:
+            yield i, channel
 
 
 def _edge_mask(channel: ChannelLikelihood, margin: float = 3.0) -> np.ndarray:

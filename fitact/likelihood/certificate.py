@@ -76,8 +76,6 @@ def compress_channel(
             smooth = np.asarray(electrical.smooth)[part]
             how |= {"smooth": smooth, "slope": np.gradient(smooth, arrays[1])}
         compression = compress(*arrays, expected_terms=terms, delayed=_shifts_response(channel), **how)
-        if electrical.noise_gain is not None:
-            compression = dataclasses.replace(compression, noise_gain=electrical.noise_gain)
     return dataclasses.replace(channel, compression=compression), ""
 
 

@@ -221,7 +221,7 @@ class ChannelLikelihood(eqx.Module):
             return compression.to_rows @ signal, compression.holds(signal, timing)
         terms, delay = self.electrical.terms(inputs), self.timing.shift + inputs.delay
         covered = compression.covers(jnp.stack(jnp.broadcast_arrays(*terms.tau)), delay)
-        response = inputs.gain * compression.response(terms, delay)
+        response = inputs.gain * compression.response(terms, delay, self.electrical.noise_gain)
         if self.samples.charges is not None:
             response = response + inputs.gain * inputs.delay * compression.rows_delay_derivative(terms)
         if inputs.effects is not None:

@@ -83,7 +83,6 @@ class Compression(eqx.Module):
     # dV/dt of a measured drive (V/s) between the samples k - i - 1 and k - i, for the ages i from `origin` on, and the
     # noise of V (V), which no delay moves; empty if the response cannot be delayed
     steps: Float[Array, "ages+1 rows"]
-    noise_gain: Float[Array, ""]  # of the noise of V in a response that can be delayed, for all parameters
     origin: Float[Array, ""]  # delay of `signal`, in time steps
     time_step: Float[Array, ""]  # s
     effects: Float[Array, "effects rows"] | None = None  # see `ChannelLikelihood.effects`
@@ -103,16 +102,21 @@ class Compression(eqx.Module):
         """Largest delay from `origin`, in time steps."""
         return len(self.steps) // 2
 
-    def response(self, terms: HighpassTerms, delay: ArrayLike = 0.0) -> Float[Array, " rows"]:
-        """Return the response of a circuit (compare `fitact.response`) with a `delay` (s), if it has `steps`."""
+    def response(
+        self, terms: HighpassTerms, delay: ArrayLike = 0.0, noise_gain: ArrayLike | None = None
+    ) -> Float[Array, " rows"]:
+        """Return the response of a circuit (compare `fitact.response`) with a `delay` (s), if it has `steps`.
+
+        `noise_gain` is that of the noise of V beside `steps`; None means that of the circuit.
+        """
         series, slopes = [], jnp.zeros(len(self.steps))
         for index, (weight, tau) in enumerate(zip(terms.weight, terms.tau, strict=True)):
             if len(self.steps):
                 growth, gains = self._shift(delay, tau)
                 weight, slopes = weight * growth, slopes + weight * growth * gains
             series.append(weight * self._series(tau, index))
-        if len(self.steps):
-            slopes = slopes.at[-1].add(self.noise_gain - terms.jump)
+        if len(self.steps) and noise_gain is not None:
+            slopes = slopes.at[-1].add(noise_gain - terms.jump)
         total = self.signal @ (jnp.concatenate(series) if self.center.ndim else sum(series, jnp.zeros(())))
         total = jnp.pad(total, (0, self.observed.size - total.size)) + slopes @ self.steps
         if terms.direct is not None:
@@ -159,8 +163,7 @@ class Compression(eqx.Module):
 
     def _falling_response(self, terms: HighpassTerms, drive_slope: Float[Array, " rows"]) -> Float[Array, " rows"]:
         falling = HighpassTerms(tuple(w / t for w, t in zip(terms.weight, terms.tau, strict=True)), terms.tau)
-        without_noise = dataclasses.replace(self, noise_gain=jnp.zeros(()))
-        return without_noise.response(falling) - terms.jump * drive_slope
+        return self.response(falling, noise_gain=0.0) - terms.jump * drive_slope
 
     def decays(self, tau: Array, index: int = 0) -> Float[Array, " rows"]:
         """Return e^{-(t - t0) / tau}, where t0 is the first sample; `index` is that of the time constant."""
@@ -262,7 +265,9 @@ class GridCompression(Compression):
         """Return True, since the grid belongs to the circuit."""
         return np.ones(np.shape(tau), dtype=bool)
 
-    def response(self, terms: HighpassTerms, delay: ArrayLike = 0.0) -> Float[Array, " rows"]:
+    def response(
+        self, terms: HighpassTerms, delay: ArrayLike = 0.0, noise_gain: ArrayLike | None = None
+    ) -> Float[Array, " rows"]:
         """Return the response of a circuit, undelayed; compare `fitact.response`."""
         if terms.direct is not None:
             raise TypeError("a compression on a grid holds no V, which a leak of the insulator needs")

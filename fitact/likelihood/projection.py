@@ -535,7 +535,6 @@ def assemble_compression(
         observed_slope=observed_slope,
         samples=np.asarray(float(samples)),
         steps=functions["steps"].T,
-        noise_gain=np.asarray(np.sum(table.expected_series if table.is_grid else table.expected_series[0])),
         origin=np.zeros(()),
         time_step=table.step,
     )

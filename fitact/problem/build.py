@@ -179,9 +179,10 @@ def build_problem(
 
 def _set_noise_gains(likelihood: Likelihood, theta: Float[np.ndarray, " circuit_parameters"]) -> Likelihood:
     """Return the likelihood in which the noise of recorded drives has the gains of the circuit at theta."""
-    circuit = likelihood.evaluate_circuit(theta)
+    circuit = None
     for i, channel in enumerate(likelihood.channels):
         if isinstance(channel.observable, ElectricalSignal) and channel.electrical.smooth is not None:
+            circuit = circuit or likelihood.evaluate_circuit(theta)
             gain = np.asarray(circuit.terms[channel.channel].jump, dtype=float)
             likelihood = likelihood.replace_channel(i, channel.replace_observable(noise_gain=gain))
     return likelihood

@@ -229,6 +229,6 @@ def test_what_cannot_have_a_leak_is_refused():
         fitact.WithSkin(fitact.FinalCircuit(R, C, CI, Ri=RI), fitact.Fractional())
     empty = np.zeros(3)
     arrays = 0.0, 1.0, np.zeros((1, 4)), np.zeros((3, 4)), np.zeros((6, 3)), empty, empty, empty, empty, 3.0
-    table = Compression(*map(np.asarray, (*arrays, np.zeros((0, 3)), 0.0, 0.0, 1.0)))
+    table = Compression(*map(np.asarray, (*arrays, np.zeros((0, 3)), 0.0, 1.0)))
     with pytest.raises(TypeError, match="this compression holds no V"):
         table.response(HighpassTerms((1.0,), (1.0,), None, 0.1))
