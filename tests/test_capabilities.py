@@ -10,7 +10,6 @@ import fitact
 from fitact.batch import fit_many
 from tests.capabilities import CAPABILITIES, FUNCTIONS, MAX_ERROR, PAGE, Capability, render_table
 
-FITTED = "body resistance R_H"  # a track refuses it once a window has been fitted
 SPECTRA = ("impedance spectrum", "gain spectrum Vsc / V")  # which share what is compiled
 
 
@@ -18,7 +17,7 @@ def cells() -> list[object]:
     found = []
     for row, name in itertools.product(CAPABILITIES, FUNCTIONS):
         # each kind of record compiles for ten seconds or more, and a fractional skin is simulated for as long
-        is_quick = row.name in SPECTRA or (name in row.refused and row.name not in ("fractional skin", FITTED))
+        is_quick = row.name in SPECTRA or (name in row.refused and row.name != "fractional skin")
         found.append(pytest.param(row, name, id=f"{row.name}-{name}", marks=() if is_quick else pytest.mark.slow))
     return found
 

@@ -5,7 +5,7 @@ import functools
 import itertools
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +35,7 @@ from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.observable import LINEAR_NUISANCES
 from fitact.likelihood.projection import MAX_DELAY, is_exactly_uniform
+from fitact.likelihood.smooth_drive import smooth_drive
 from fitact.model.circuit import passes_direct_current
 from fitact.model.force import force_constant
 from fitact.model.response_table import ResponseTable, chebyshev
@@ -108,9 +109,9 @@ class RecordedDriveProblem(BatchProblem):
         frequency, begin = record.frequency(), int(np.searchsorted(time, float(fitted.derive.time[0])))
         period = math.inf if frequency is None else 1.0 / (frequency * shared.time_step)  # samples
         # only the fields that all records share matter
-        fields = dict.fromkeys((field.name for field in dataclasses.fields(Compression)), 0.0)
+        fields = dict.fromkeys((field.name for field in dataclasses.fields(Compression) if field.name != "short"), 0.0)
         fields |= {"half_width": HALF_WIDTH, "samples": counted.size, "origin": origin, "time_step": shared.time_step}
-        table = Compression(**{name: np.asarray(float(value)) for name, value in fields.items()})
+        table = Compression(**dict[str, Any]({name: np.asarray(float(value)) for name, value in fields.items()}))
         trace = trace.keep_ends().replace_timing(shift=np.asarray(delay))
         trace = dataclasses.replace(trace, columns=tuple(sorted(places)), compression=table)
         return cls(
@@ -136,9 +137,7 @@ class RecordedDriveProblem(BatchProblem):
         """Fit `unit` records, and optionally test the residuals for structure (`whiteness`), in double precision."""
         V, Vsc = stack_channel(records, "V"), stack_channel(records, "Vsc")
         driven, screened = Screening.from_values(V, self.settings), Screening.from_values(Vsc, self.settings)
-        # the ADC's steps, which take long to find, are looked for only where they may exceed the noise
-        rounding = np.array([0.0 if fine else rounding_noise_sd(v) for v, fine in zip(V, driven.fine, strict=True)])
-        noise_V = np.hypot(driven.noise, rounding)
+        noise_V = _drive_noise(V, driven)
         tables = Tables.from_records(self.shared, V, Vsc, noise_V)
         gain_sd = None
         if "gain" in self.names:
@@ -169,8 +168,9 @@ class RecordedDriveProblem(BatchProblem):
 
     def tabulate_responses(self, records: Sequence[Record], optima: BatchFit) -> ResponseTable:
         """Return responses at the times of `derive` for each of `unit` records."""
-        drives, shared, size = stack_channel(records, "V"), self.shared, self.derive.time.size
-        return _tabulate_responses(shared, self.evaluated.start, size, optima.inputs.table["center"], drives)
+        V, size = stack_channel(records, "V"), self.derive.time.size
+        noise = _drive_noise(V, Screening.from_values(V, self.settings))
+        return _tabulate_responses(self.shared, self.evaluated.start, size, optima.inputs.table["center"], V, noise)
 
     def _figures(
         self,
@@ -238,6 +238,13 @@ class RecordedDriveProblem(BatchProblem):
         """Return the names of the nuisances that were fitted, as in `Fit.model`."""
         names = itertools.compress(LINEAR_NUISANCES, is_free)
         return ", ".join([*names, *(name for name in self.names if name in ("gain", "delay"))])
+
+
+def _drive_noise(V: Float[np.ndarray, "records samples"], driven: Screening) -> Float[np.ndarray, " records"]:
+    """Return the sd of the noise of drives with that of their rounding, V."""
+    # the ADC's steps, which take long to find, are looked for only where they may exceed the noise
+    rounding = [0.0 if fine else rounding_noise_sd(v) for v, fine in zip(V, driven.fine, strict=True)]
+    return np.hypot(driven.noise, rounding)
 
 
 @functools.partial(jit, fast=True)
@@ -352,14 +359,15 @@ def _tabulate_responses(
     count: int,
     center: Float[Array, " records"],
     V: Float[Array, "records samples"],
+    noise: Float[Array, " records"],
 ) -> ResponseTable:
-    """Return a table for each record, padded to `count` times."""
+    """Return a table for each record, padded to `count` times; `noise` is the sd of that of V."""
     series = chebyshev(TABLE_NODES)[1].T
 
-    def tabulate_record(record: tuple[Array, Array]) -> ResponseTable:
-        center, v = record
+    def tabulate_record(record: tuple[Array, Array, Array]) -> ResponseTable:
+        center, v, sd = record
         nodes = table_nodes(jnp.exp(center))
-        own = shared.filter_drive(v, jnp.zeros_like(v), nodes, v)[:TABLE_NODES]
+        own = shared.filter_drive(v, jnp.zeros_like(v), nodes, smooth_drive(v, sd))[:TABLE_NODES]
         decays = (shared.decay @ shared.decay_polynomials(nodes)).T @ shared.functions
         signal, decay = (
             jnp.pad(series.T @ each[:, begin : begin + count], ((0, 0), (0, max(begin + count - v.size, 0)))).T
@@ -367,4 +375,4 @@ def _tabulate_responses(
         )
         return make_response_table(center, signal, decay)
 
-    return map_blocks(tabulate_record, (center, V), RECORD_BLOCK)
+    return map_blocks(tabulate_record, (center, V, noise), RECORD_BLOCK)

@@ -101,16 +101,16 @@ class SharedFunctions(NamedTuple):
         tau: Float[Array, " nodes"],
         smooth: Float[Array, " samples"],
     ) -> Float[Array, "own samples"]:
-        """Return the functions of a record: the responses to V at the nodes, the `steps`, and last Vsc itself.
+        """Return the functions of a record: the responses to `smooth` at the nodes, the `steps`, and last Vsc itself.
 
-        They are those at the times of the drive, i.e. without the delay `origin`. `smooth` is V as a delay shifts it.
+        They are those at the times of the drive, i.e. without the delay `origin`. `smooth` is V without its noise.
         """
         x, samples = self.time_step / tau, V.size
         rises = jnp.diff(jnp.pad(smooth, (AGES + 1, AGES), mode="edge")) / self.time_step
         steps = [*(rises[AGES - age : AGES - age + samples] for age in range(-AGES, AGES)), V - smooth]
         # the first sample is a jump from 0
-        rise = jnp.pad(jnp.diff(V, prepend=V[:1]), (0, -samples % _BLOCK))
-        u = uniform_recurrence(rise, V[0] * jnp.exp(x), x, _BLOCK)[:, :samples]
+        rise = jnp.pad(jnp.diff(smooth, prepend=smooth[:1]), (0, -samples % _BLOCK))
+        u = uniform_recurrence(rise, smooth[0] * jnp.exp(x), x, _BLOCK)[:, :samples]
         return jnp.concatenate([u, jnp.stack([*steps, jnp.roll(Vsc, -self.origin)])])
 
 
@@ -128,7 +128,7 @@ class Tables(NamedTuple):
     Attributes:
         g, b: estimates of the parameters, around which each table lies (b in s).
         is_possible: whether they could be estimated.
-        smooth: V as a delay shifts it (`smooth_drive`).
+        smooth: V without its noise (`smooth_drive`), to which the records respond.
         decay: decays of an unknown charge at the nodes, in the shared functions.
         coordinates: orthogonal coordinates of the functions, with the inner products over the fitted samples.
     """

@@ -17,7 +17,14 @@ from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
-from fitact.likelihood.observable import CHARGES, FIRST_CHARGE, LINEAR_NUISANCES, ChannelInputs, charge_decays
+from fitact.likelihood.observable import (
+    CHARGES,
+    FIRST_CHARGE,
+    LINEAR_NUISANCES,
+    ChannelInputs,
+    ElectricalSignal,
+    charge_decays,
+)
 from fitact.model.circuit import Circuit, charge_ratios
 from fitact.model.drive import Drive, Multitone, Periodic, PiecewiseLinear, Sampled, Sine
 from fitact.model.force import Geometry, electrostatic_force, friction, mean_force, peak_force, summarize
@@ -210,11 +217,17 @@ def _draw_force(derive: DerivedQuantities, point: Array, deviate: Array) -> Arra
 def derived_from_fit(
     likelihood: Likelihood, record: Record, choice: DriveModel, scene: Scene, b: float
 ) -> DerivedQuantities:
-    """Return the derived quantities of a fit, from its first record and drive; `b` is its slowest time constant (s)."""
-    last = None if isinstance(likelihood.template, WithSkin) else _last_periods(record, choice, b)
+    """Return the derived quantities of a fit, from its first record and drive; `b` is its slowest time constant (s).
+
+    The drive is without its noise if the likelihood knows it so.
+    """
+    drive, observable = choice.drive, likelihood.channels[0].observable
+    if isinstance(drive, Sampled) and isinstance(observable, ElectricalSignal) and observable.smooth is not None:
+        drive = dataclasses.replace(drive, samples=observable.smooth)
+    last = None if isinstance(likelihood.template, WithSkin) else _last_periods(record, drive, b)
     # the peak for a frequency-dependent skin is taken half a step after an ideal jump
     jump_delay = 0.5 * record.time_step if isinstance(likelihood.template, WithSkin) else 0.0
-    drive, grid = (choice.drive, _grid(record, choice, jump_delay)) if last is None else last
+    drive, grid = (drive, _grid(record, choice, jump_delay)) if last is None else last
     steady_state, charge = choice.steady_state and last is None, choice.unknown_charge and last is None
     return DerivedQuantities(likelihood.without_samples(), drive, *_settings(scene, grid), steady_state, charge)
 
@@ -234,7 +247,7 @@ def _settings(scene: Scene, grid: tuple[np.ndarray, np.ndarray]) -> tuple[Any, A
 
 def _last_periods(
     record: Record,
-    choice: DriveModel,
+    drive: Drive,
     b: float,
     max_samples: int = 20_000,
     window: int = 4_000,
@@ -246,15 +259,15 @@ def _last_periods(
     least one. The drive begins `lead_taus` time constants earlier.
     """
     frequency, time = record.frequency(), record.time
-    if not isinstance(choice.drive, Sampled) or frequency is None or time.size <= max_samples:
+    if not isinstance(drive, Sampled) or frequency is None or time.size <= max_samples:
         return None
     periods = max(1, math.floor(window * record.time_step * frequency))
     begin = int(np.searchsorted(time, time[-1] - periods / frequency + 0.5 * record.time_step))
     lead = int(np.searchsorted(time, time[begin] - lead_taus * b))
     if lead == 0:
         return None
-    drive = Sampled(pad_samples(time[lead:]), pad_samples(record["V"][lead:]))
-    return drive, (pad_samples(time[begin:]), pad_weight(np.gradient(time)[begin:]))
+    last = Sampled(pad_samples(time[lead:]), pad_samples(np.asarray(drive.samples)[lead : time.size]))
+    return last, (pad_samples(time[begin:]), pad_weight(np.gradient(time)[begin:]))
 
 
 def derived_from_scene(likelihood: Likelihood, scene: Scene) -> DerivedQuantities:

@@ -22,6 +22,7 @@ from fitact.likelihood.observable import ChannelInputs
 from fitact.likelihood.projection import MANY_SAMPLES, compress, is_exactly_uniform, samples_per_period, table_multiple
 from fitact.likelihood.spectrum_observable import SpectrumObservable
 from fitact.model.circuit import HighpassTerms
+from fitact.model.drive import Sampled
 from fitact.model.skin import WithSkin
 
 TOLERANCE = 1e-3  # error of the log-likelihood
@@ -52,7 +53,7 @@ def compress_channel(
         return channel, reason
     samples, electrical = channel.samples, channel.electrical
     part = slice(samples.size)
-    arrays = electrical.drive, np.asarray(samples.time)[part], np.asarray(samples.observed)[part]
+    drive, time, observed = electrical.drive, np.asarray(samples.time)[part], np.asarray(samples.observed)[part]
     how: dict[str, Any] = {
         "student": student,
         "steady_state": electrical.steady_state,
@@ -67,21 +68,21 @@ def compress_channel(
         channel = fold(channel)
         inputs = ChannelInputs(circuit, np.asarray(1.0), np.asarray(0.0), np.asarray(0.0))
         signal = _signal(channel, inputs)[part]
-        slope = -np.gradient(signal, arrays[1])
-        compression = compress(*arrays, expected_terms=terms, slope=slope, **how)
+        slope = -np.gradient(signal, time)
+        compression = compress(drive, time, observed, expected_terms=terms, slope=slope, **how)
         fields = {field.name: getattr(compression, field.name) for field in dataclasses.fields(compression)}
         compression = GridCompression(**fields)
-    else:
-        if electrical.smooth is not None:
-            smooth = np.asarray(electrical.smooth)[part]
-            how |= {"smooth": smooth, "slope": np.gradient(smooth, arrays[1])}
-        compression = compress(*arrays, expected_terms=terms, delayed=_shifts_response(channel), **how)
-    return dataclasses.replace(channel, compression=compression), ""
-
-
-def _shifts_response(channel: ChannelLikelihood) -> bool:
-    """Return whether a delay or clock error shifts the response; rows of charges are shifted to first order."""
-    return bool(channel.timing.free) and channel.samples.charges is None
+        return dataclasses.replace(channel, compression=compression), ""
+    smooth = None if electrical.smooth is None else np.asarray(electrical.smooth)[part]
+    if smooth is not None:
+        how["slope"] = np.gradient(smooth, time)
+    if isinstance(drive, Sampled) and channel.shifts_response:
+        V = np.asarray(drive.samples)[part]
+        smooth = V if smooth is None else smooth
+        drive, how["noise"] = Sampled(time, smooth), V - smooth
+    short = channel.count_short(start.tau)
+    compression = compress(drive, time, observed, expected_terms=terms.without_fastest(short), **how)
+    return dataclasses.replace(channel, compression=dataclasses.replace(compression, short=short)), ""
 
 
 _signal = jit(ChannelLikelihood.signal)
@@ -122,15 +123,18 @@ def reason_against_table(
     if reason := reason_against_compression(channel, tolerance):
         return reason
     if isinstance(start.circuit, WithSkin):
-        if _shifts_response(channel):
+        if channel.shifts_response:
             return _TIMING_REASON
         # inner products would lose digits of large weights
         if channel.channel == "I" and not channel.observable.follows_samples:
             return "the current of a fractional skin is not tabulated"
         return "a dispersive skin has no time constants" if start.circuit.grid is None else ""
-    if _shifts_response(channel) and not can_delay(channel, start.tau):
+    if channel.shifts_response and not _can_delay(channel):
         return _TIMING_REASON
-    if table_multiple(start.tau) > max_multiple:
+    tau = start.tau[: start.tau.size - channel.count_short(start.tau)]
+    if not tau.size:
+        return "the time constants of the circuit are far below the time step"
+    if table_multiple(tau) > max_multiple:
         return "the time constants of the circuit are too far apart"
     return ""
 
@@ -228,12 +232,11 @@ def can_interpolate(channel: ChannelLikelihood) -> bool:
     return channel.compression is None and channel.noise != "student" and not channel.observable.follows_samples
 
 
-def can_delay(channel: ChannelLikelihood, tau: Float[np.ndarray, " terms"]) -> bool:
-    """Return whether a compression represents a delay: of a measured drive on a uniform grid, if no tau is short."""
+def _can_delay(channel: ChannelLikelihood) -> bool:
+    """Return whether a compression represents a delay: of a measured drive on a uniform grid."""
     if not channel.observable.follows_samples or channel.timing.free != ("delay",):
         return False
-    time = np.asarray(channel.samples.time)[: channel.samples.size]
-    return bool(np.min(tau) > 2.0 * channel.timing.step) and is_exactly_uniform(time)
+    return is_exactly_uniform(np.asarray(channel.samples.time)[: channel.samples.size])
 
 
 def certify(
@@ -397,10 +400,11 @@ def _restrict_table(
         return channel
     if not np.all(table.covers(np.asarray(terms.tau, dtype=float), delay)):
         return channel
+    tabulated = slice(len(terms.tau) - table.short)
     largest = float(np.sum(np.abs(terms.weight)) * inputs.gain)
     has_charge = max(channel.columns, default=0) >= len(BASELINE_NAMES)
     charge = float(np.ptp(channel.samples.observed)) / largest if has_charge else 0.0
-    ends = (np.log(terms.tau) + side * reach for side in (-1.0, 1.0))
+    ends = (np.log(terms.tau[tabulated]) + side * reach[tabulated] for side in (-1.0, 1.0))
     low, high = (np.clip(end, table.center - table.half_width, table.center + table.half_width) for end in ends)
     # time constants that may become equal exchange their places, and need one range
     group = np.cumsum(np.append(0, high[1:] < low[:-1]))

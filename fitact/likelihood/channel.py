@@ -74,6 +74,20 @@ class ChannelLikelihood(eqx.Module):
         """Vsc or I in time, of which the observable is made; TypeError for a spectrum."""
         return self.observable.electrical
 
+    @property
+    def shifts_response(self) -> bool:
+        """Whether a delay or clock error shifts the response; rows of charge are shifted to first order."""
+        return bool(self.timing.free) and self.samples.charges is None
+
+    def count_short(self, tau: Float[np.ndarray, " terms"], longest: float = 0.33) -> int:
+        """Return of how many time constants (s) a few steps of the drive give the delayed response.
+
+        They are below `longest` time steps. The way of a table, back from a sample, would lose their digits.
+        """
+        if not self.shifts_response or not self.observable.follows_samples:
+            return 0
+        return int(np.count_nonzero(np.asarray(tau) < longest * self.timing.step))
+
     def qualified_name(self, name: str) -> str:
         """Return the name of a nuisance, followed by the channel's label if there are several channels."""
         return f"{name}_{self.label}" if self.label else name
@@ -186,7 +200,8 @@ class ChannelLikelihood(eqx.Module):
         remainder = self.compression.observed - self._compressed_signal(inputs)[0]
         shapes = [self.compression.baseline]
         if isinstance(self.compression, Compression) and not isinstance(self.compression, GridCompression):
-            taus = inputs.circuit.channel_terms(self.channel).tau
+            terms = inputs.circuit.channel_terms(self.channel)
+            taus = terms.without_fastest(self.compression.short).tau  # those decay before the first sample that counts
             shapes += [self.compression.decays(tau, index)[None] for index, tau in enumerate(taus)]
         missing = len(LINEAR_NUISANCES) - sum(map(len, shapes))
         shapes.append(jnp.zeros((missing, remainder.size)))

@@ -8,6 +8,7 @@ coordinates are Chebyshev series. `fitact.likelihood.projection` computes them.
 import dataclasses
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -81,20 +82,25 @@ class Compression(eqx.Module):
     observed_slope: Float[Array, " rows"]  # derivative of `observed` in log sigma, 0 but for `StudentExpansion`
     samples: Float[Array, ""]  # number of samples
     # dV/dt of a measured drive (V/s) between the samples k - i - 1 and k - i, for the ages i from `origin` on, and the
-    # noise of V (V), which no delay moves; empty if the response cannot be delayed
+    # noise of V (V), which only `response` with a `noise_gain` has; empty if the response cannot be delayed
     steps: Float[Array, "ages+1 rows"]
     origin: Float[Array, ""]  # delay of `signal`, in time steps
     time_step: Float[Array, ""]  # s
     effects: Float[Array, "effects rows"] | None = None  # see `ChannelLikelihood.effects`
     voltage: Float[Array, " rows"] | None = None  # V, for circuits on whose skin a constant V acts
+    # number of the fastest time constants of the circuit that are so short that `steps` give the response
+    short: int = eqx.field(static=True, default=0)
 
     def covers(self, tau: Array, delay: ArrayLike = 0.0) -> Array:
         """Return whether the table covers the time constant (s) and the delay (s)."""
-        xp = array_module(tau)
-        covered = abs(xp.log(tau) - self.center) <= self.half_width
+        xp, none = array_module(tau), np.full(self.short, np.nan)
+        center, half_width = (xp.append(x, none) if x.ndim else x for x in (self.center, self.half_width))
+        covered = abs(xp.log(tau) - center) <= half_width
         if not len(self.steps):
             return covered
         since = delay / self.time_step - self.origin
+        if self.short:  # the response to what was before the first of `steps` has decayed to 3e-4
+            covered = covered | (8.0 * tau / self.time_step <= self.reach - since)
         return covered & (abs(since) <= self.reach)
 
     @property
@@ -103,22 +109,25 @@ class Compression(eqx.Module):
         return len(self.steps) // 2
 
     def response(
-        self, terms: HighpassTerms, delay: ArrayLike = 0.0, noise_gain: ArrayLike | None = None
+        self, terms: HighpassTerms, delay: ArrayLike = 0.0, noise_gain: ArrayLike = 0.0
     ) -> Float[Array, " rows"]:
         """Return the response of a circuit (compare `fitact.response`) with a `delay` (s), if it has `steps`.
 
-        `noise_gain` is that of the noise of V beside `steps`; None means that of the circuit.
+        The noise of V beside `steps` is added with its gain.
         """
-        series, slopes = [], jnp.zeros(len(self.steps))
+        series, slopes = [], jnp.zeros(2 * self.reach)
         for index, (weight, tau) in enumerate(zip(terms.weight, terms.tau, strict=True)):
+            if index >= len(terms.tau) - self.short:
+                slopes = slopes + weight * self._respond_to_steps(delay, tau)
+                continue
             if len(self.steps):
                 growth, gains = self._shift(delay, tau)
                 weight, slopes = weight * growth, slopes + weight * growth * gains
             series.append(weight * self._series(tau, index))
-        if len(self.steps) and noise_gain is not None:
-            slopes = slopes.at[-1].add(noise_gain - terms.jump)
         total = self.signal @ (jnp.concatenate(series) if self.center.ndim else sum(series, jnp.zeros(())))
-        total = jnp.pad(total, (0, self.observed.size - total.size)) + slopes @ self.steps
+        total = jnp.pad(total, (0, self.observed.size - total.size))
+        if len(self.steps):
+            total = total + jnp.append(slopes, noise_gain) @ self.steps
         if terms.direct is not None:
             if self.voltage is None:
                 raise TypeError("this compression holds no V, which a leak of the insulator needs")
@@ -126,15 +135,20 @@ class Compression(eqx.Module):
         return total if terms.rate is None else total + terms.rate * self.rate
 
     def _shift(self, delay: ArrayLike, tau: ArrayLike) -> tuple[Array, Float[Array, "*nodes ages"]]:
-        """Return factors p, q such that the response delayed by `delay` is p (signal + q @ steps).
+        """Return factors p, q such that the response delayed by `delay` is p (signal + q @ steps[:-1]).
 
         On the way back from a sample to an earlier time, the response u grows by 1 / decay, and each part of a linear
-        step of the drive that has not yet happened is subtracted. The noise of V in u does not grow.
+        step of the drive that has not yet happened is subtracted.
         """
         xp, (since, ends, sign) = array_module(tau), self._shifted_parts(delay)
         gained = -sign * tau * xp.exp(-ends[..., :-1] / tau) * xp.expm1(-xp.diff(ends) / tau)
-        noise = xp.expm1(-since / tau) * np.ones(1)
-        return xp.exp(since / tau), xp.concatenate([gained, noise], axis=-1)
+        return xp.exp(since / tau), gained
+
+    def _respond_to_steps(self, delay: ArrayLike, tau: Array) -> Float[Array, " ages"]:
+        """Return what to multiply `steps[:-1]` by for the response of a short time constant, delayed by `delay`."""
+        since = delay - self.origin * self.time_step
+        ends = jnp.maximum(self.time_step * np.arange(-self.reach, self.reach + 1) - since, 0.0)
+        return -tau * jnp.exp(-ends[:-1] / tau) * jnp.expm1(-jnp.diff(ends) / tau)
 
     def _shift_voltage(self, voltage: Float[Array, " rows"], delay: ArrayLike) -> Float[Array, " rows"]:
         """Return V with a `delay` (s), beside its noise."""
@@ -163,10 +177,10 @@ class Compression(eqx.Module):
 
     def _falling_response(self, terms: HighpassTerms, drive_slope: Float[Array, " rows"]) -> Float[Array, " rows"]:
         falling = HighpassTerms(tuple(w / t for w, t in zip(terms.weight, terms.tau, strict=True)), terms.tau)
-        return self.response(falling, noise_gain=0.0) - terms.jump * drive_slope
+        return self.response(falling) - terms.jump * drive_slope
 
     def decays(self, tau: Array, index: int = 0) -> Float[Array, " rows"]:
-        """Return e^{-(t - t0) / tau}, where t0 is the first sample; `index` is that of the time constant."""
+        """Return e^{-(t - t0) / tau}, where t0 is the first sample; `index` is that of a time constant of the table."""
         series = self._series(tau, index)
         first = index * series.size if self.center.ndim else 0
         return self.decay[:, first : first + series.size] @ series
@@ -182,7 +196,8 @@ class Compression(eqx.Module):
 
         Both are numbers, or arrays with one for each time constant.
         Omitted terms change no response, and no decay of a `charge` (V), by more than `precision` (V, root of the
-        sum of squares). If `charge` is 0, the decay is omitted. `delay` (s) is the range of delays.
+        sum of squares). If `charge` is 0, the decay is omitted. `delay` (s) is the range of delays, unless there are
+        short time constants, which need all steps.
         """
         x, to_series = chebyshev(min(node_count(float(np.max(half_width))), self.signal.shape[1]))
         # nodes of the narrow table in the wide one, with NumPy because JAX would compile its loop for every record
@@ -214,7 +229,7 @@ class Compression(eqx.Module):
             baseline=found["baseline"].T,
             steps=found["steps"].T,
             origin=np.asarray(origin),
-            **{name: found[name][:, 0] for name in (*columns, "observed")},
+            **dict[str, Any]({name: found[name][:, 0] for name in (*columns, "observed")}),
         )
         return changed.with_functions(found["effects"].T, self.voltage is not None)
 
@@ -230,8 +245,8 @@ class Compression(eqx.Module):
         """Return signals at the nodes `tau` and V, delayed to a new origin in the range `delay`; its steps; itself."""
         signal = np.pad(np.asarray(signal), ((0, self.observed.size - len(signal)), (0, 0)))
         voltage = None if self.voltage is None else np.asarray(self.voltage)
-        if not len(self.steps):
-            return signal, voltage, np.asarray(self.steps), 0.0
+        if not len(self.steps) or self.short:
+            return signal, voltage, np.asarray(self.steps), float(self.origin)
         low, high = (edge / float(self.time_step) - float(self.origin) for edge in delay)
         middle = round(0.5 * (low + high))
         ages = min(2 ** math.ceil(math.log2(max(high - middle, middle - low, 1.0))), self.reach)
@@ -241,7 +256,7 @@ class Compression(eqx.Module):
         since = np.asarray(origin * float(self.time_step))
         growth, gains = self._shift(since, tau[:, None])
         voltage = None if voltage is None else self._shift_voltage(voltage, since)
-        signal = growth.T * (signal + np.asarray(self.steps).T @ gains.T)
+        signal = growth.T * (signal + np.asarray(self.steps[:-1]).T @ gains.T)
         kept = [*range(first, first + 2 * ages), 2 * self.reach]
         return signal, voltage, np.asarray(self.steps)[kept], origin
 
@@ -266,7 +281,7 @@ class GridCompression(Compression):
         return np.ones(np.shape(tau), dtype=bool)
 
     def response(
-        self, terms: HighpassTerms, delay: ArrayLike = 0.0, noise_gain: ArrayLike | None = None
+        self, terms: HighpassTerms, delay: ArrayLike = 0.0, noise_gain: ArrayLike = 0.0
     ) -> Float[Array, " rows"]:
         """Return the response of a circuit, undelayed; compare `fitact.response`."""
         if terms.direct is not None:

@@ -13,7 +13,7 @@ from fitact.likelihood.compression import BASELINE_NAMES
 from fitact.likelihood.padded_samples import PaddedSamples
 from fitact.model.circuit import Channel, Circuit, HighpassTerms
 from fitact.model.drive import Drive, Sampled
-from fitact.model.response import highpass, response_and_rate
+from fitact.model.response import response_and_rate
 from fitact.model.skin import WithSkin
 
 CHARGES = ("charge", "charge_2", "charge_3", "charge_4")  # one for each time constant, the slowest first
@@ -100,7 +100,7 @@ class ElectricalSignal(Observable):
     channel: Channel = eqx.field(static=True)  # "Vsc", "I", or the voltage that generates a force
     steady_state: bool = eqx.field(static=True)  # or from rest
     smooth: Float[Array, " samples"] | None = None  # recorded drive as a delay shifts it (`smooth_drive`), V
-    noise_gain: ArrayLike | None = None  # of the rest of the drive, for all parameters and delays
+    noise_gain: ArrayLike = 0.0  # of the rest of the drive, for all parameters and delays
 
     @property
     def electrical(self) -> "ElectricalSignal":
@@ -152,22 +152,16 @@ class ElectricalSignal(Observable):
         return inputs.gain * total
 
     def _delay_smooth_drive(self, recorded: Array, inputs: ChannelInputs, time: Array) -> Float[Array, " samples"]:
-        """Return the response at the drive's `time` to the smooth drive, and undelayed to the rest of the drive.
+        """Return the response at the drive's `time` to the smooth drive, with the rest of the drive as `recorded`.
 
-        A parameter or a delay that made the noise of V smaller would be drawn there. So V without it, and the response
-        to the noise, have a gain that is the same for all. As in the table of responses, what V left until the time of
-        a sample decays, or grows, until the drive's time.
+        A parameter or a delay that made the noise of V smaller would be drawn there. So the noise has a gain that is
+        the same for all.
         """
         assert isinstance(self.drive, Sampled)
         smooth = dataclasses.replace(self.drive, samples=self.smooth)
         rest = dataclasses.replace(self.drive, samples=self.drive.samples - self.smooth)
-        how: dict[str, Any] = {"steady_state": self.steady_state, "channel": self.channel}
-        (total, _), terms = response_and_rate(inputs.circuit, smooth, time, **how), self.terms(inputs)
-        noise = rest.value(recorded)
-        for weight, tau in zip(terms.weight, terms.tau, strict=True):
-            before = highpass(rest, recorded, tau, steady_state=self.steady_state) - noise
-            total = total + weight * jnp.exp((recorded - time) / tau) * before
-        return total + self.noise_gain * noise
+        total, _ = response_and_rate(inputs.circuit, smooth, time, steady_state=self.steady_state, channel=self.channel)
+        return total + self.noise_gain * rest.value(recorded)
 
     def response_and_rate(self, inputs: ChannelInputs, time: Array) -> tuple[Array, ArrayLike | None]:
         """Return the response without what follows dV/dt, and the capacitance that does (F), or None."""

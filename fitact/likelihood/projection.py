@@ -64,11 +64,10 @@ def compress(
     whitening: Whitening | None = None,
     charges: ChargeRows | None = None,
     rate: Float[np.ndarray, " samples"] | None = None,
-    delayed: bool = False,
     slope: Float[np.ndarray, " samples"] | None = None,
     student: Float[np.ndarray, "3 samples"] | None = None,
     effects: Float[np.ndarray, "effects samples"] | None = None,
-    smooth: Float[np.ndarray, " samples"] | None = None,
+    noise: Float[np.ndarray, " samples"] | None = None,
 ) -> Compression:
     """Project a record on responses to `drive`, for time constants within a factor 9 of the one in `expected_terms`.
 
@@ -78,13 +77,14 @@ def compress(
     A `Sampled` drive has the times of the record, and may be padded. The response of `expected_terms` is close to the
     record; it is subtracted before and added after, so that the noise keeps its digits. The table covers more than a
     factor 9 if several terms need it (see `table_multiple`). `weight` multiplies the residuals of the samples
-    (0 excludes a sample, None means 1). `rate` is dV/dt (V/s) for a channel that follows it. If `delayed`, the response
-    to a measured drive on a uniform grid can be shifted by up to `MAX_DELAY` steps; V is then taken as constant before
-    the first and after the last sample. `slope` replaces dV/dt in the field of that name. `student`
-    holds weights of the squares, and two functions to be projected instead of the record; `observed` and its slope are
-    then without the model at which they were computed. `charges` are rows that take the place of `observed`, `rate` and
-    `slope`, and of the filter. `effects` are further functions of the model. `smooth` is a measured V as a delay shifts
-    it (`smooth_drive`), V.
+    (0 excludes a sample, None means 1). `rate` is dV/dt (V/s) for a channel that follows it. `slope` replaces dV/dt in
+    the field of that name. `student` holds weights of the squares, and two functions to be projected instead of the
+    record; `observed` and its slope are then without the model at which they were computed. `charges` are rows that
+    take the place of `observed`, `rate` and `slope`, and of the filter. `effects` are further functions of the model.
+
+    With `noise`, the response to a measured drive on a uniform grid can be shifted by up to `MAX_DELAY` steps; V is
+    then taken as constant before the first and after the last sample. The noise is what was recorded of V beside the
+    drive (V), see `smooth_drive`.
 
     Terms of a grid of time constants have arrays of weights and time constants; the table then holds the responses of
     the grid instead of series.
@@ -119,14 +119,11 @@ def compress(
         len(table.series),
         decays=measured and not table.is_grid,
         effects=samples.n_effects,
-        ages=2 * MAX_DELAY + 1 if measured and delayed else 0,
+        ages=0 if noise is None else 2 * MAX_DELAY + 1,
     )
     filtering = WhiteningState.start(taps, sum(sizes.values()), charges)
     if isinstance(drive, Sampled) and measured:
-        shifted = None
-        if delayed:
-            shifted = np.asarray(drive.samples)[: time.size] if smooth is None else smooth
-        parts = _accumulate_measured(table, drive, samples, filtering, shifted)
+        parts = _accumulate_measured(table, drive, samples, filtering, noise)
     else:
         is_simple = steady_state and taps is None and student is None
         period = samples_per_period(drive, time) if is_simple else None
@@ -432,9 +429,9 @@ def _accumulate_measured(
     drive: Sampled,
     samples: Samples,
     filtering: WhiteningState | None,
-    shifted: Float[np.ndarray, " samples"] | None,
+    noise: Float[np.ndarray, " samples"] | None,
 ) -> Iterator[np.ndarray]:
-    """Yield the inner products of each chunk for a measured drive; `shifted` is V as a delay shifts it."""
+    """Yield the inner products of each chunk for a measured drive; `noise` is as in `compress`."""
     time, voltage = samples.time, np.asarray(drive.samples)[: samples.time.size]
     length, step, first = chunk_length(time.size), float(table.step), float(voltage[0])
     x = step / table.nodes if is_exactly_uniform(time) and step < 300.0 * np.min(table.nodes) else None  # no overflow
@@ -445,19 +442,18 @@ def _accumulate_measured(
     advance = jit(_advance_chunk, fast=time.size > MANY_SAMPLES)
     for number, (chunk, driven) in enumerate(zip(chunks(samples, length), voltages, strict=True)):
         steps = np.empty((0, length))
-        if shifted is not None:
-            steps = drive_steps(shifted, voltage, number * length, length, step)
+        if noise is not None:
+            steps = drive_steps(voltage, noise, number * length, length, step)
         total, last, filtering = advance(table, chunk, driven.observed, steps, last, time[0], x, filtering)
         yield total
 
 
 def drive_steps(
-    smooth: np.ndarray, voltage: np.ndarray, first: int, length: int, step: float
+    voltage: np.ndarray, noise: np.ndarray, first: int, length: int, step: float
 ) -> Float[np.ndarray, "ages+1 samples"]:
     """Return `Compression.steps` at `length` samples, for `MAX_DELAY` ages before and after each, and 0 for padding."""
     indices = np.clip(np.arange(first - MAX_DELAY, first + length + MAX_DELAY + 1), 0, voltage.size - 1)
-    slopes = np.diff(smooth[indices]) / step
-    noise = (voltage - smooth[: voltage.size])[first : first + length]
+    slopes, noise = np.diff(voltage[indices]) / step, noise[first : first + length]
     ages = [slopes[i : i + length] for i in reversed(range(2 * MAX_DELAY))]
     return np.array([*ages, np.pad(noise, (0, length - noise.size))])
 

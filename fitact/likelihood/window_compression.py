@@ -25,6 +25,7 @@ from fitact.likelihood.compression import (
 from fitact.likelihood.likelihood import CircuitValues
 from fitact.likelihood.noise import Whitening
 from fitact.likelihood.projection import (
+    MAX_DELAY,
     TableNodes,
     assemble_compression,
     drive_steps,
@@ -43,7 +44,7 @@ class FilterState(NamedTuple):
     """State of the responses at the end of a window, from which the next one goes on."""
 
     end: float  # time of the first sample after the window, s
-    voltage: float  # last V
+    voltage: float  # last V to which the filters respond
     memory: Float[np.ndarray, "nodes 1"]  # of the filters
     age: float  # time since the drive was first known, s
 
@@ -70,18 +71,24 @@ class WindowCompressor:
     time: Float[np.ndarray, " samples"]  # from the start of a window, s
     # decays in the combinations of the table, and the baseline that each channel has; rows of a current
     shared: tuple[Float[np.ndarray, "functions samples"], ...]
-    noise_V: float  # sd of the noise of V, V
+    noise_V: float  # sd of the noise of V, V; 0 if the channels respond to V with its noise
+    short: int  # see `Compression.short`
 
     @classmethod
     def from_channels(
         cls, channels: Sequence[ChannelLikelihood], circuit: CircuitValues, samples: int, step: float, noise_V: float
     ) -> Self:
-        """Make the tables around the time constants of a circuit, a factor `REACH` either way."""
-        time = step * np.arange(samples)
-        reach = (math.log(REACH), count_nodes(math.log(REACH), 1e-8)) if len(circuit.tau) == 1 else None
+        """Make the tables around the time constants of a circuit, a factor `REACH` either way.
+
+        `noise_V` is the sd of the noise of V, to which a channel whose response may be delayed does not respond.
+        """
+        time, short = step * np.arange(samples), channels[0].count_short(circuit.tau)
+        is_single = circuit.tau.size - short == 1
+        reach = (math.log(REACH), count_nodes(math.log(REACH), 1e-8)) if is_single else None
         tables, shared = [], []
         for each in channels:
-            table = TableNodes.from_terms(circuit.terms[each.channel], time, narrow=False, reach=reach)
+            terms = circuit.terms[each.channel].without_fastest(short)
+            table = TableNodes.from_terms(terms, time, narrow=False, reach=reach)
             if reach is not None:
                 kept = slice(RANK)
                 table = dataclasses.replace(table, combinations=table.combinations[:, kept], series=table.series[kept])
@@ -89,42 +96,50 @@ class WindowCompressor:
             functions = np.vstack([_decays(table, time), *(baseline[name] for name in _baseline_names(each))])
             tables.append(table)
             shared.append(functions if each.samples.charges is None else step_means(functions))
-        return cls(tuple(channels), tuple(tables), time, tuple(shared), noise_V)
+        noise = noise_V if any(each.shifts_response for each in channels) else 0.0
+        return cls(tuple(channels), tuple(tables), time, tuple(shared), noise, short)
 
     def compress(
         self,
         V: Samples,
         given: Sequence[Samples | MakeRows],
         weights: Sequence[Samples | None],
+        smooth: Samples,
         responses: Float[np.ndarray, "nodes samples"],
         has_charge: bool,
     ) -> tuple[tuple[Compression, ...], tuple[TrendInputs, ...], Compression | None]:
         """Compress a window with the drive `V`: each channel's samples and weights, or rows of charge.
 
-        `responses` are those of `respond`. With `has_charge`, the charge at the first sample is unknown. Also returns
-        what a trend within the window needs, and the samples of the responses if the first channel is whitened.
+        `smooth` and `responses` are those of `respond`. With `has_charge`, the charge at the first sample is unknown.
+        Also returns what a trend within the window needs, and the samples of the responses if the first channel is
+        whitened.
         """
         late, rank = self.time - 0.5 * self.time[-1], len(self.tables[0].series)
         functions = np.empty((rank + TREND_RANK + 2, V.size))
         combined = np.matmul(self.tables[0].combinations.T, responses, out=functions[:rank])
         np.multiply(late, combined[:TREND_RANK], out=functions[rank:-2])
-        functions[-2], found = V, []
+        functions[-2], found, steps = V, [], np.empty((0, V.size))
+        if any(each.shifts_response for each in self.channels):
+            steps = drive_steps(smooth, V - smooth, 0, V.size, float(self.time[1]))
         for i, pair in enumerate(zip(given, weights, strict=True)):
             functions[-1] = self.tables[i].expected @ responses
-            found.append(self._compress_channel(i, late, functions, *pair, has_charge))
+            found.append(self._compress_channel(i, late, functions, steps, *pair, has_charge))
         parts, inputs = zip(*found, strict=True)
-        if self.channels[0].samples.charges is None and self.channels[0].samples.whitening is None:
+        first = self.channels[0]
+        if first.samples.charges is None and first.samples.whitening is None and not first.shifts_response:
             return parts, inputs, None
-        decays = _decays(self.tables[0], self.time)[: rank * has_charge]
-        sizes = function_sizes(rank, decays=True)
-        sampled = _find_coordinates({"signal": combined, "decay": decays}, sizes)
-        return parts, inputs, assemble_compression(self.tables[0], sampled, V.size)
+        steps = steps if self.short else steps[:0]
+        own = {"signal": combined, "decay": _decays(self.tables[0], self.time)[: rank * has_charge], "steps": steps}
+        sampled = _find_coordinates(own, function_sizes(rank, decays=True, ages=len(steps)))
+        table = assemble_compression(self.tables[0], sampled, V.size)
+        return parts, inputs, dataclasses.replace(table, short=self.short)
 
     def _compress_channel(
         self,
         index: int,
         late: Samples,
         functions: Float[np.ndarray, "functions samples"],
+        steps: Float[np.ndarray, "ages samples"],
         given: Samples | MakeRows,
         weight: Samples | None,
         has_charge: bool,
@@ -132,8 +147,12 @@ class WindowCompressor:
         """Compress a channel; the `functions` are the responses, those of trends, V, and what the tables expect."""
         channel, table, step = self.channels[index], self.tables[index], float(self.time[1])
         rank, charged = len(table.series), has_charge * len(table.series)
-        shared, steps = self.shared[index][rank - charged :], np.empty((0, late.size))
-        rows, whitening = None, None
+        shared, rows, whitening = self.shared[index][rank - charged :], None, None
+        if not channel.shifts_response:
+            steps = steps[:0]
+        else:  # samples at the ends may respond to the V of other windows
+            weight = np.ones(late.size) if weight is None else weight.copy()
+            weight[:MAX_DELAY] = weight[-MAX_DELAY:] = 0.0
         if callable(given):
             functions = step_means(functions)
             rows = given([functions[:-2], shared])
@@ -145,9 +164,6 @@ class WindowCompressor:
             whitening = None if fitted is None else _make_filter(fitted, weight, late.size)
             used = weight if whitening is None else whitening.mask
             count = late.size if used is None else int(np.count_nonzero(used))
-            if channel.timing.free:
-                smooth = smooth_drive(functions[-2], self.noise_V)
-                steps = drive_steps(smooth, functions[-2], 0, late.size, step)
         rest = observed - functions[-1] - (0.0 if table.expected_rate is None else table.expected_rate * rate)
         own = {"signal": functions[:rank], "decay": shared[:charged], "steps": steps}
         own |= zip(_baseline_names(channel), shared[charged:, None], strict=True)
@@ -159,7 +175,7 @@ class WindowCompressor:
         )
         late_signal = found["late"] @ table.series[:TREND_RANK]
         trend = TrendInputs(late_signal, found["late_rate"][:, 0], found["voltage"][:, 0])
-        return assemble_compression(table, found, count), trend
+        return dataclasses.replace(assemble_compression(table, found, count), short=self.short), trend
 
     def expect(self, V: Samples, responses: Float[np.ndarray, "nodes samples"]) -> Samples:
         """Return the samples of the first channel with the tables' circuit, without its charge."""
@@ -169,13 +185,14 @@ class WindowCompressor:
 
     def respond(
         self, V: Float[np.ndarray, " samples"], start: float, before: FilterState | None
-    ) -> tuple[Float[np.ndarray, "nodes samples"], FilterState]:
-        """Return the responses at the nodes to the V of a window from `start` (s) on, and their state at its end.
+    ) -> tuple[Samples, Float[np.ndarray, "nodes samples"], FilterState]:
+        """Return what the channels respond to in the V of a window from `start` (s) on, and the responses at the nodes.
 
-        u[k] = e^{-x} u[k - 1] + phi(x) (V[k] - V[k - 1]). Without a state `before`, V was constant before the window.
+        Also return the state at the end. u[k] = e^{-x} u[k - 1] + phi(x) (V[k] - V[k - 1]). Without a state `before`, V
+        was constant before the window.
         """
-        step = float(self.time[1])
-        rise = np.diff(V, prepend=V[0] if before is None else before.voltage)
+        step, smooth = float(self.time[1]), smooth_drive(V, self.noise_V) if self.noise_V else V
+        rise = np.diff(smooth, prepend=smooth[0] if before is None else before.voltage)
         nodes = self.tables[0].nodes
         memory = np.zeros((nodes.size, 1)) if before is None else before.memory
         responses, left = np.empty((nodes.size, V.size)), np.empty((nodes.size, 1))
@@ -183,7 +200,7 @@ class WindowCompressor:
             responses[i], left[i] = filter_highpass(rise, x, memory[i])
         length = step * V.size
         age = length + (0.0 if before is None else before.age)
-        return responses, FilterState(start + length, float(V[-1]), left, age)
+        return smooth, responses, FilterState(start + length, float(smooth[-1]), left, age)
 
 
 def _find_coordinates(

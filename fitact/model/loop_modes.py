@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -25,6 +26,16 @@ class HighpassTerms(NamedTuple):
     def jump(self) -> ArrayLike:
         """Height of the response to a jump of 1, beside what follows `rate`."""
         return sum(self.weight, 0.0 if self.direct is None else self.direct)
+
+    def without_fastest(self, count: int) -> "HighpassTerms":
+        """Return the terms without those of the `count` last, i.e. shortest, time constants."""
+        kept = slice(len(self.tau) - count)
+        return self._replace(weight=self.weight[kept], tau=self.tau[kept])
+
+    def gain_in_step(self, step: float) -> ArrayLike:
+        """Return the response to a drive that rises by 1 within a time `step` (s), at its end, beside the `rate`."""
+        gains = (w * -np.expm1(-step / tau) * (tau / step) for w, tau in zip(self.weight, self.tau, strict=True))
+        return sum(gains, 0.0 if self.direct is None else self.direct)
 
     def stack(self) -> tuple[Array, Array]:
         """Return the weights and the time constants as arrays."""

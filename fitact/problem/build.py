@@ -183,7 +183,7 @@ def _set_noise_gains(likelihood: Likelihood, theta: Float[np.ndarray, " circuit_
     for i, channel in enumerate(likelihood.channels):
         if isinstance(channel.observable, ElectricalSignal) and channel.electrical.smooth is not None:
             circuit = circuit or likelihood.evaluate_circuit(theta)
-            gain = np.asarray(circuit.terms[channel.channel].jump, dtype=float)
+            gain = np.asarray(circuit.terms[channel.channel].gain_in_step(channel.timing.step), dtype=float)
             likelihood = likelihood.replace_channel(i, channel.replace_observable(noise_gain=gain))
     return likelihood
 
@@ -268,7 +268,9 @@ def _build_channel(
     smooth = _smooth_drive(record) if channel == "Vsc" and _can_smooth(choice, template) else None
     shift, step = (np.asarray(each, dtype=float) for each in (choice.shift, record.time_step))
     timing = DriveTiming(shift, np.zeros(()), step, _timing_sd(record, choice, channel, skew_sd), free)
-    linear_sd, noise_floor = _prior_of_nuisances(record, choice, scene, channel, len(taus) * choice.unknown_charge)
+    # without the samples of an unknown drive, a charge that decays within half a step is over
+    n_charges = int(np.count_nonzero(taus > 0.5 * record.time_step)) if free else taus.size
+    linear_sd, noise_floor = _prior_of_nuisances(record, choice, scene, channel, n_charges * choice.unknown_charge)
     likelihood = ChannelLikelihood(
         samples=PaddedSamples(
             time=pad_samples(record.time),

@@ -33,7 +33,7 @@ class WindowData(NamedTuple):
 
     compressions: tuple[Compression, ...]
     trends: tuple[TrendInputs, ...]  # of each channel
-    samples: Compression | None  # of the responses, if the first channel is compressed in rows of charge
+    samples: Compression | None  # of the responses at all samples, if the first channel is not compressed in them
 
 
 class CompressedWindow(NamedTuple):
@@ -72,6 +72,7 @@ class WindowResponses(NamedTuple):
     """A window with what its compression needs; without responses where it has lost samples or no drive."""
 
     window: Window
+    drive: Float[np.ndarray, " samples"] | None  # V as the channels respond to it
     responses: Float[np.ndarray, "nodes samples"] | None
     recorded: list[np.ndarray | MakeRows]  # of each channel
     weights: list[np.ndarray | None]  # of its samples, or None where all are 1
@@ -105,12 +106,12 @@ class WindowModel(NamedTuple):
             V = window.channels["V"]
             if not window.is_whole or float(np.std(V)) < least_rms:
                 state = None
-                yield WindowResponses(window, None, [], [], False, math.nan, math.nan)
+                yield WindowResponses(window, None, None, [], [], False, math.nan, math.nan)
                 continue
             if state is not None and abs(window.start - state.end) > 0.5 * step:
                 state = None
             has_charge = state is None or state.age < settled
-            responses, state = self.compressor.respond(V, window.start, state)
+            drive, responses, state = self.compressor.respond(V, window.start, state)
             channels = self.fit.likelihood.channels
             samples = [window.channels[channel.channel] for channel in channels]
             clipped = [clipping_mask(values) for values in samples]
@@ -121,15 +122,16 @@ class WindowModel(NamedTuple):
             if not is_in_contact(lowest, highest):
                 state = None
             is_clipped = any(each is not None for each in weights)
-            yield WindowResponses(window, responses, recorded, weights, has_charge, lowest, highest, is_clipped)
+            rest = recorded, weights, has_charge, lowest, highest, is_clipped
+            yield WindowResponses(window, drive, responses, *rest)
 
     def compress(self, given: WindowResponses) -> CompressedWindow:
         """Compress a window; one without responses has no data."""
         data = None
-        if given.responses is not None:
-            V = given.window.channels["V"]
+        if given.drive is not None and given.responses is not None:
+            V, driven = given.window.channels["V"], (given.drive, given.responses)
             channels = given.recorded, given.weights
-            data = WindowData(*self.compressor.compress(V, *channels, given.responses, given.has_charge))
+            data = WindowData(*self.compressor.compress(V, *channels, *driven, given.has_charge))
         return CompressedWindow(given.window.start, data, given.lowest, given.highest, given.clipped)
 
     def _make_rows(self, window: Window) -> MakeRows:
@@ -228,7 +230,9 @@ def require_table(model: WindowModel, source: str) -> None:
     """Refuse a circuit whose responses have no table, so that windows cannot be compressed."""
     likelihood = model.fit.likelihood
     circuit = likelihood.evaluate_circuit(model.fit.theta)
-    reasons = (reason_against_table(each, circuit, TOLERANCE) for each in likelihood.channels)
+    reasons = [reason_against_table(each, circuit, TOLERANCE) for each in likelihood.channels]
+    if len({each.count_short(circuit.tau) for each in likelihood.channels}) > 1:
+        reasons.append("a time constant of I is far below the time step")
     if reason := next(filter(None, reasons), ""):
         raise InputError(
             f"{source}: windows cannot be represented by a few numbers, because {reason}; leave out a small resistance"

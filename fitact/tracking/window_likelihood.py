@@ -168,7 +168,8 @@ def _mean_square(
     _, beta, _ = channel.fit_nuisances(inputs, sigma[0])
     sizes = dict(zip(channel.columns, beta * channel.linear_sd[np.array(channel.columns, dtype=int)], strict=True))
     recorded = circuit.channel_terms(channel.channel)
-    for index, (ratio, tau) in enumerate(zip(charge_ratios(terms, recorded), recorded.tau, strict=False)):
+    decaying = recorded.without_fastest(compression.short).tau
+    for index, (ratio, tau) in enumerate(zip(charge_ratios(terms, recorded), decaying, strict=False)):
         if FIRST_CHARGE + index in sizes:
             voltage = voltage + sizes[FIRST_CHARGE + index] / inputs.gain * ratio * compression.decays(tau, index)
     names, gains = model.names, channel.drive_gains

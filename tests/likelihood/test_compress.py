@@ -1,5 +1,6 @@
 """The compressed likelihood against sums over the samples that are computed independently."""
 
+import dataclasses
 import math
 import re
 
@@ -147,7 +148,7 @@ def test_delay_of_a_measured_drive(delay: float):
         time,
         y,
         steady_state=False,
-        delayed=True,
+        noise=np.zeros(steps),
         expected_terms=HighpassTerms((0.05,), (TAU,)),
     )
     narrow = compression.restrict(
@@ -162,6 +163,33 @@ def test_delay_of_a_measured_drive(delay: float):
         scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
         found = products(np.stack([ours, *table.baseline, table.observed]))
         np.testing.assert_allclose(found / scale, expected / scale, atol=1e-9)
+
+
+@pytest.mark.parametrize("delay", [-3.3, 0.0, 0.7, 1.9])
+@pytest.mark.parametrize("tau", [0.01, 0.1, 0.4])
+def test_steps_give_the_delayed_response_of_a_short_time_constant(delay: float, tau: float):
+    """Responses to a polyline on the finer grid, with a long one beside; `tau` is in time steps."""
+    rng, step, steps = np.random.default_rng(9), 2e-6, 3_000
+    time, fine = step * np.arange(steps), step / 10.0 * np.arange(10 * (steps + 10))
+    voltage, y, tau = np.cumsum(rng.standard_normal(steps)), rng.standard_normal(steps), tau * step
+    voltage[:20] = voltage[-20:] = 0.0
+    u = sum(w * unit_response(fine, np.interp(fine, time, voltage), t) for w, t in ((0.3, TAU), (0.7, tau)))
+    delayed = np.interp(time - delay * step, fine, u)
+    noise, terms = rng.standard_normal(steps), HighpassTerms((0.3,), (TAU,))
+    table = compress(fitact.Sampled(time, voltage), time, y, steady_state=False, expected_terms=terms, noise=noise)
+    table = dataclasses.replace(table, short=1)
+    narrow = table.restrict(
+        np.log([TAU]), np.full(1, 0.1), 1e-10, charge=0.0, delay=((delay - 0.1) * step, (delay + 0.1) * step)
+    )
+    for each in (table, narrow):
+        assert each.covers(np.array([TAU, tau]), delay * step).all()
+        assert not each.covers(np.array([TAU, 2.0 * step]), delay * step)[1]
+        ours = each.response(HighpassTerms((0.3, 0.7), (TAU, tau)), delay * step, 0.05)
+        expected = products(np.stack([delayed + 0.05 * noise, *slow(time), y]))
+        scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+        found = products(np.stack([ours, *each.baseline, each.observed]))
+        # what was 4.1 steps ago has decayed to 4e-5
+        np.testing.assert_allclose(found / scale, expected / scale, atol=1e-6 if tau == 0.4 * step else 1e-9)
 
 
 def test_several_time_constants_far_apart():

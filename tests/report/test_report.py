@@ -87,7 +87,7 @@ def test_force_law_stands_beside_every_force_and_estimates_stand_in_the_circuit(
 
 
 def test_untrusted_answers_say_so_at_the_top(finger_fit: fitact.Fit, tmp_path):
-    posterior = fitact.sample(finger_fit, walkers=16, max_steps=100, progress=False)
+    posterior = fitact.sample(finger_fit, walkers=16, max_steps=50, progress=False)
     posterior.report(tmp_path / "report.html")
     words = " ".join(Page((tmp_path / "report.html").read_text()).words)
     assert words.index("do not use these numbers") < words.index("Determined by the data")

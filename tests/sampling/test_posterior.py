@@ -31,7 +31,7 @@ def test_force_of_a_draw_by_hand(finger_posterior: fitact.Posterior):
     for draw in (0, 1000):
         Rsc, Csc, Ci, charge = (draws[name][1, draw] for name in ("Rsc", "Csc", "Ci", "charge"))
         with jax.enable_x64(True):
-            vsc = fitact.response(fitact.FinalCircuit(Rsc, Csc, Ci), fit.choice.drive, record.time, steady_state=False)
+            vsc = fitact.response(fitact.FinalCircuit(Rsc, Csc, Ci), fit.derive.drive, record.time, steady_state=False)
         vsc = np.asarray(vsc) + charge * np.exp(-record.time / (Rsc * (2.0 * Ci + Csc)))
         fe = vsc**2 / (2.0 * (1.0 / Ci + 1.0 / Csc) * (1e-6 + 200e-6))
         assert force["force_mean"][1, draw] == pytest.approx(fe.mean(), rel=1e-6)
@@ -59,7 +59,7 @@ def test_a_table_of_thresholds_gives_the_sensation_of_each_draw(finger_posterior
         )
         with jax.enable_x64(True):
             vsc = fitact.response(
-                fitact.FinalCircuit(Rsc, Csc, Ci), felt.fit.choice.drive, record.time, steady_state=False
+                fitact.FinalCircuit(Rsc, Csc, Ci), felt.fit.derive.drive, record.time, steady_state=False
             )
         vsc = np.asarray(vsc) + charge * np.exp(-record.time / (Rsc * (2.0 * Ci + Csc)))
         friction = mu * vsc**2 / (2.0 * (1.0 / Ci + 1.0 / Csc) * (1e-6 + 200e-6))
