@@ -111,8 +111,8 @@ class WindowCompressor:
         """Compress a window with the drive `V`: each channel's samples and weights, or rows of charge.
 
         `smooth` and `responses` are those of `respond`. With `has_charge`, the charge at the first sample is unknown.
-        Also returns what a trend within the window needs, and the samples of the responses if the first channel is
-        whitened.
+        Also returns what a trend within the window needs, and the responses at all samples, unless the first channel
+        is compressed in them.
         """
         late, rank = self.time - 0.5 * self.time[-1], len(self.tables[0].series)
         functions = np.empty((rank + TREND_RANK + 2, V.size))
@@ -124,13 +124,14 @@ class WindowCompressor:
         for i, pair in enumerate(zip(given, weights, strict=True)):
             functions[-1] = self.tables[i].expected @ responses
             found.append(self._compress_channel(i, late, functions, steps, *pair, has_charge))
-        parts, inputs = zip(*found, strict=True)
-        first = self.channels[0]
-        if first.samples.charges is None and first.samples.whitening is None and not first.shifts_response:
+        parts, inputs, (products, *_) = zip(*found, strict=True)
+        first, steps = self.channels[0], steps if self.short else steps[:0]
+        if products is None and first.samples.charges is None and first.samples.whitening is None:
             return parts, inputs, None
-        steps = steps if self.short else steps[:0]
-        own = {"signal": combined, "decay": _decays(self.tables[0], self.time)[: rank * has_charge], "steps": steps}
-        sampled = _find_coordinates(own, function_sizes(rank, decays=True, ages=len(steps)))
+        if products is None:
+            decays = _decays(self.tables[0], self.time)[: rank * has_charge]
+            products = WindowProducts.from_functions({"signal": combined, "decay": decays, "steps": steps})
+        sampled = _find_coordinates(products, function_sizes(rank, decays=True, ages=len(steps)))
         table = assemble_compression(self.tables[0], sampled, V.size)
         return parts, inputs, dataclasses.replace(table, short=self.short)
 
@@ -143,8 +144,11 @@ class WindowCompressor:
         given: Samples | MakeRows,
         weight: Samples | None,
         has_charge: bool,
-    ) -> tuple[Compression, TrendInputs]:
-        """Compress a channel; the `functions` are the responses, those of trends, V, and what the tables expect."""
+    ) -> "tuple[Compression, TrendInputs, WindowProducts | None]":
+        """Compress a channel; the `functions` are the responses, those of trends, V, and what the tables expect.
+
+        Also returns inner products over all samples, if some are excluded and the others are not whitened.
+        """
         channel, table, step = self.channels[index], self.tables[index], float(self.time[1])
         rank, charged = len(table.series), has_charge * len(table.series)
         shared, rows, whitening = self.shared[index][rank - charged :], None, None
@@ -170,12 +174,16 @@ class WindowCompressor:
         own |= {"rate": rate[None], "slope": slope[None], "observed": rest[None]}
         own |= {"late": functions[rank:-2], "late_rate": (late * rate)[None], "voltage": functions[-2:-1]}
         sizes = function_sizes(rank, decays=True, effects=len(channel.effect_sizes), ages=len(steps))
-        found = _find_coordinates(
-            own, sizes | {"late": TREND_RANK, "late_rate": 1, "voltage": 1}, weight, rows, whitening
-        )
+        whole = products = WindowProducts.from_functions(own, rows, whitening)
+        if rows is None and whitening is None and weight is not None:
+            excluded = weight == 0.0
+            ends = WindowProducts.from_functions({name: each[:, excluded] for name, each in own.items()})
+            products = products._replace(values=products.values - ends.values)
+        found = _find_coordinates(products, sizes | {"late": TREND_RANK, "late_rate": 1, "voltage": 1})
         late_signal = found["late"] @ table.series[:TREND_RANK]
         trend = TrendInputs(late_signal, found["late_rate"][:, 0], found["voltage"][:, 0])
-        return dataclasses.replace(assemble_compression(table, found, count), short=self.short), trend
+        compression = dataclasses.replace(assemble_compression(table, found, count), short=self.short)
+        return compression, trend, None if products is whole else whole
 
     def expect(self, V: Samples, responses: Float[np.ndarray, "nodes samples"]) -> Samples:
         """Return the samples of the first channel with the tables' circuit, without its charge."""
@@ -203,27 +211,34 @@ class WindowCompressor:
         return smooth, responses, FilterState(start + length, float(smooth[-1]), left, age)
 
 
-def _find_coordinates(
-    functions: Mapping[str, Float[np.ndarray, "some samples"]],
-    sizes: Mapping[str, int],
-    weight: Samples | None = None,
-    charges: ChargeRows | None = None,
-    whitening: Whitening | None = None,
-) -> dict[str, Columns]:
-    """Return coordinates of functions, 0 for those of `sizes` that are absent, so that windows have equal shapes.
+class WindowProducts(NamedTuple):
+    """Inner products of functions over a window."""
 
-    Functions over the samples have a `weight` or a filter; rows are whitened like `charges`.
-    """
-    places = place_functions(sizes)
-    kept = np.concatenate([places[name][: len(each)] for name, each in functions.items()])
-    rows, total = np.concatenate(list(functions.values())), np.zeros(2 * [sum(sizes.values())])
-    if charges is not None:
-        rows = whiten_rows(charges.gain, charges.decay, rows) * charges.used
-    elif whitening is not None:
-        rows = whitening.filter(np.pad(rows, [(0, 0), (whitening.taps.size - 1, 0)]))
-    elif weight is not None:
-        rows = rows * weight
-    total[np.ix_(kept, kept)] = rows @ rows.T
+    sizes: dict[str, int]  # number of functions, by name
+    values: Float[np.ndarray, "functions functions"]
+
+    @classmethod
+    def from_functions(
+        cls,
+        functions: Mapping[str, Float[np.ndarray, "some samples"]],
+        charges: ChargeRows | None = None,
+        whitening: Whitening | None = None,
+    ) -> Self:
+        """Multiply functions over the samples, which may have a filter, or rows that are whitened like `charges`."""
+        rows = np.concatenate(list(functions.values()))
+        if charges is not None:
+            rows = whiten_rows(charges.gain, charges.decay, rows) * charges.used
+        elif whitening is not None:
+            rows = whitening.filter(np.pad(rows, [(0, 0), (whitening.taps.size - 1, 0)]))
+        return cls({name: len(each) for name, each in functions.items()}, rows @ rows.T)
+
+
+def _find_coordinates(products: WindowProducts, sizes: Mapping[str, int]) -> dict[str, Columns]:
+    """Return coordinates of the functions of `sizes`, 0 for absent ones, so that windows have equal shapes."""
+    places, given, total = place_functions(sizes), place_functions(products.sizes), np.zeros(2 * [sum(sizes.values())])
+    pairs = [(place[: given[name].size], given[name][: place.size]) for name, place in places.items() if name in given]
+    kept, there = map(np.concatenate, zip(*pairs, strict=True))
+    total[np.ix_(kept, kept)] = products.values[np.ix_(there, there)]
     return split_functions(factor_products(total)[0], sizes)
 
 
