@@ -172,6 +172,12 @@ CAPABILITIES = (
     ),
     Capability("body resistance R_H", circuit={"grounding": {"R_H": 500.0}}),
     Capability(
+        "body resistance R_H, Vsc and I",
+        ("Vsc", "I"),
+        circuit={"grounding": {"R_H": 500.0}},
+        determined=IDENTIFIED,
+    ),
+    Capability(
         "leak Ri of the insulator",
         circuit={"device": {"Ri": 2e6}},
         scene={"prior": {"Ci": PANEL, "Ri": {"factor": 3.0}}},

@@ -28,7 +28,7 @@ from fitact.likelihood.noise import (
     student_residual,
     student_weight,
 )
-from fitact.likelihood.observable import LINEAR_NUISANCES, ChannelInputs, DriveTiming, ElectricalSignal
+from fitact.likelihood.observable import LINEAR_NUISANCES, SHORT_TAU, ChannelInputs, DriveTiming, ElectricalSignal
 from fitact.likelihood.padded_samples import PaddedSamples
 from fitact.likelihood.projection import MAX_DELAY, baseline_functions
 from fitact.likelihood.spectrum_observable import SpectrumObservable
@@ -79,14 +79,14 @@ class ChannelLikelihood(eqx.Module):
         """Whether a delay or clock error shifts the response; rows of charge are shifted to first order."""
         return bool(self.timing.free) and self.samples.charges is None
 
-    def count_short(self, tau: Float[np.ndarray, " terms"], longest: float = 0.33) -> int:
+    def count_short(self, tau: Float[np.ndarray, " terms"]) -> int:
         """Return of how many time constants (s) a few steps of the drive give the delayed response.
 
-        They are below `longest` time steps. The way of a table, back from a sample, would lose their digits.
+        They are below `SHORT_TAU` time steps. The way of a table, back from a sample, would lose their digits.
         """
         if not self.shifts_response or not self.observable.follows_samples:
             return 0
-        return int(np.count_nonzero(np.asarray(tau) < longest * self.timing.step))
+        return int(np.count_nonzero(np.asarray(tau) < SHORT_TAU * self.timing.step))
 
     def qualified_name(self, name: str) -> str:
         """Return the name of a nuisance, followed by the channel's label if there are several channels."""
@@ -200,7 +200,7 @@ class ChannelLikelihood(eqx.Module):
         remainder = self.compression.observed - self._compressed_signal(inputs)[0]
         shapes = [self.compression.baseline]
         if isinstance(self.compression, Compression) and not isinstance(self.compression, GridCompression):
-            terms = inputs.circuit.channel_terms(self.channel)
+            terms = self.electrical.terms(inputs)
             taus = terms.without_fastest(self.compression.short).tau  # those decay before the first sample that counts
             shapes += [self.compression.decays(tau, index)[None] for index, tau in enumerate(taus)]
         missing = len(LINEAR_NUISANCES) - sum(map(len, shapes))

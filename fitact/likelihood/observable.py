@@ -13,13 +13,14 @@ from fitact.likelihood.compression import BASELINE_NAMES
 from fitact.likelihood.padded_samples import PaddedSamples
 from fitact.model.circuit import Channel, Circuit, HighpassTerms
 from fitact.model.drive import Drive, Sampled
-from fitact.model.response import response_and_rate
+from fitact.model.response import response_and_rate, superpose_terms
 from fitact.model.skin import WithSkin
 
 CHARGES = ("charge", "charge_2", "charge_3", "charge_4")  # one for each time constant, the slowest first
 LINEAR_NUISANCES = (*BASELINE_NAMES, *CHARGES)
 FIRST_CHARGE = len(BASELINE_NAMES)
 TIMING_NUISANCES = ("delay", "clock")
+SHORT_TAU = 0.33  # time steps below which a time constant is short: a recorded V does not show what happens within it
 
 
 class ChannelInputs(eqx.Module):
@@ -101,6 +102,8 @@ class ElectricalSignal(Observable):
     steady_state: bool = eqx.field(static=True)  # or from rest
     smooth: Float[Array, " samples"] | None = None  # recorded drive as a delay shifts it (`smooth_drive`), V
     noise_gain: ArrayLike = 0.0  # of the rest of the drive, for all parameters and delays
+    # number of the fastest time constants that are so short that I follows dV/dt instead, later by them
+    lags: int = eqx.field(static=True, default=0)
 
     @property
     def electrical(self) -> "ElectricalSignal":
@@ -165,16 +168,24 @@ class ElectricalSignal(Observable):
 
     def response_and_rate(self, inputs: ChannelInputs, time: Array) -> tuple[Array, ArrayLike | None]:
         """Return the response without what follows dV/dt, and the capacitance that does (F), or None."""
-        how: dict[str, Any] = {"steady_state": self.steady_state, "channel": self.channel}
-        total, rate = response_and_rate(inputs.circuit, self.drive, time, **how)
+        if self.lags:
+            terms = self.select_terms(inputs.circuit.channel_terms(self.channel))
+            total, rate = superpose_terms(terms, self.drive, time, steady_state=self.steady_state), terms.rate
+        else:
+            how: dict[str, Any] = {"steady_state": self.steady_state, "channel": self.channel}
+            total, rate = response_and_rate(inputs.circuit, self.drive, time, **how)
         return total, rate if inputs.stray is None else (0.0 if rate is None else rate) + inputs.stray
 
     def terms(self, inputs: ChannelInputs) -> HighpassTerms:
         """Return the terms of the channel over V, with the stray capacitance."""
-        terms = inputs.circuit.channel_terms(self.channel)
+        terms = self.select_terms(inputs.circuit.channel_terms(self.channel))
         if inputs.stray is None:
             return terms
         return terms._replace(rate=(0.0 if terms.rate is None else terms.rate) + inputs.stray)
+
+    def select_terms(self, terms: HighpassTerms) -> HighpassTerms:
+        """Return the terms of a circuit as the channel has them, without stray capacitance."""
+        return terms.follow_fastest(self.lags)
 
     def linear_shapes(self, samples: PaddedSamples, inputs: ChannelInputs) -> Float[Array, "4 samples"]:
         """Return the `charge_decays` at the samples."""

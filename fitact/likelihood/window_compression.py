@@ -72,7 +72,7 @@ class WindowCompressor:
     # decays in the combinations of the table, and the baseline that each channel has; rows of a current
     shared: tuple[Float[np.ndarray, "functions samples"], ...]
     noise_V: float  # sd of the noise of V, V; 0 if the channels respond to V with its noise
-    short: int  # see `Compression.short`
+    short: int  # number of the fastest time constants that are not in the tables
 
     @classmethod
     def from_channels(
@@ -82,12 +82,14 @@ class WindowCompressor:
 
         `noise_V` is the sd of the noise of V, to which a channel whose response may be delayed does not respond.
         """
-        time, short = step * np.arange(samples), channels[0].count_short(circuit.tau)
+        time, first = step * np.arange(samples), channels[0]
+        short = first.count_short(circuit.tau) + first.electrical.lags
         is_single = circuit.tau.size - short == 1
         reach = (math.log(REACH), count_nodes(math.log(REACH), 1e-8)) if is_single else None
         tables, shared = [], []
         for each in channels:
-            terms = circuit.terms[each.channel].without_fastest(short)
+            terms = each.electrical.select_terms(circuit.terms[each.channel])
+            terms = terms.without_fastest(each.count_short(circuit.tau))
             table = TableNodes.from_terms(terms, time, narrow=False, reach=reach)
             if reach is not None:
                 kept = slice(RANK)
@@ -182,7 +184,9 @@ class WindowCompressor:
         found = _find_coordinates(products, sizes | {"late": TREND_RANK, "late_rate": 1, "voltage": 1})
         late_signal = found["late"] @ table.series[:TREND_RANK]
         trend = TrendInputs(late_signal, found["late_rate"][:, 0], found["voltage"][:, 0])
-        compression = dataclasses.replace(assemble_compression(table, found, count), short=self.short)
+        compression = dataclasses.replace(
+            assemble_compression(table, found, count), short=self.short - channel.electrical.lags
+        )
         return compression, trend, None if products is whole else whole
 
     def expect(self, V: Samples, responses: Float[np.ndarray, "nodes samples"]) -> Samples:

@@ -32,6 +32,14 @@ class HighpassTerms(NamedTuple):
         kept = slice(len(self.tau) - count)
         return self._replace(weight=self.weight[kept], tau=self.tau[kept])
 
+    def follow_fastest(self, count: int) -> "HighpassTerms":
+        """Return the terms in which those of the `count` last time constants follow dV/dt, without their lag."""
+        if not count:
+            return self
+        fastest = slice(len(self.tau) - count, None)
+        rates = (w * tau for w, tau in zip(self.weight[fastest], self.tau[fastest], strict=True))
+        return self.without_fastest(count)._replace(rate=sum(rates, 0.0 if self.rate is None else self.rate))
+
     def gain_in_step(self, step: float) -> ArrayLike:
         """Return the response to a drive that rises by 1 within a time `step` (s), at its end, beside the `rate`."""
         gains = (w * -np.expm1(-step / tau) * (tau / step) for w, tau in zip(self.weight, self.tau, strict=True))

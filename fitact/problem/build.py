@@ -23,7 +23,14 @@ from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.compression import HUM_FREQUENCIES
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import Autoregression, estimate_quiet_noise, require_uniform
-from fitact.likelihood.observable import CHARGES, FIRST_CHARGE, LINEAR_NUISANCES, DriveTiming, ElectricalSignal
+from fitact.likelihood.observable import (
+    CHARGES,
+    FIRST_CHARGE,
+    LINEAR_NUISANCES,
+    SHORT_TAU,
+    DriveTiming,
+    ElectricalSignal,
+)
 from fitact.likelihood.padded_samples import PaddedSamples
 from fitact.likelihood.smooth_drive import smooth_drive
 from fitact.model.circuit import Channel, Circuit, FinalCircuit, passes_direct_current
@@ -371,8 +378,10 @@ def _make_charge_rows(
     # converters take channels in turn, and probes delay them
     delay_sd = max(1.0, scene.skew_limit("I", record.time_step) / record.time_step)
     timing = dataclasses.replace(channel.timing, free=("delay",), sd=np.array([delay_sd, channel.timing.sd[1]]))
+    # a resistance that limits I for a part of a step only makes it later
+    lags = int(np.count_nonzero(taus < SHORT_TAU * record.time_step)) if limits_current(bare.template) else 0
     channel = channel.replace_samples(whitening=None).replace_observable(
-        drive=Sampled(channel.samples.time, pad_samples(V)), steady_state=False, timing=timing
+        drive=Sampled(channel.samples.time, pad_samples(V)), steady_state=False, timing=timing, lags=lags
     )
     channel = dataclasses.replace(
         channel,
@@ -381,7 +390,7 @@ def _make_charge_rows(
         # residuals of runs of equal values are no measure of the noise
         noise_floor=np.asarray(current.noise_I * (1.0 if current.is_coarse else 0.5)),
     )
-    usable = not limits_current(bare.template) and not passes_direct_current(bare.template)
+    usable = (lags > 0 or not limits_current(bare.template)) and not passes_direct_current(bare.template)
     return set_rows(channel, rows, V, 0.0), estimate if usable else None, current.noise_I, hum
 
 

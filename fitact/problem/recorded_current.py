@@ -43,7 +43,8 @@ class Current(NamedTuple):
 
         If a resistance limits the current, its capacitance is that whose rows have the same variance.
         """
-        terms, step = inputs.circuit.channel_terms(channel.channel), float(channel.timing.step)
+        terms = channel.electrical.select_terms(inputs.circuit.channel_terms(channel.channel))
+        step = float(channel.timing.step)
         stray = 0.0 if inputs.stray is None else float(inputs.stray)
         delay = float(channel.timing.shift) / step if delay is None else delay
         if terms.rate is not None:

@@ -231,8 +231,8 @@ def require_table(model: WindowModel, source: str) -> None:
     likelihood = model.fit.likelihood
     circuit = likelihood.evaluate_circuit(model.fit.theta)
     reasons = [reason_against_table(each, circuit, TOLERANCE) for each in likelihood.channels]
-    if len({each.count_short(circuit.tau) for each in likelihood.channels}) > 1:
-        reasons.append("a time constant of I is far below the time step")
+    if len({each.count_short(circuit.tau) + each.electrical.lags for each in likelihood.channels}) > 1:
+        reasons.append("a time constant is far below the time step, and the delay of Vsc is not a free parameter")
     if reason := next(filter(None, reasons), ""):
         raise InputError(
             f"{source}: windows cannot be represented by a few numbers, because {reason}; leave out a small resistance"
