@@ -87,7 +87,7 @@ class RecordedDriveProblem(BatchProblem):
         (trace, *others), time, tau = likelihood.channels, record.time, likelihood.evaluate_circuit(fitted.theta).tau
         if others or not fitted.trusted or choice.name != "measured" or choice.steady_state:
             return None
-        is_plain = trace.channel == "Vsc" and trace.noise == "white" and trace.timing.free in ((), ("delay",))
+        is_plain = trace.channel == "Vsc" and trace.noise == "white" and trace.timing.free == ("delay",)
         is_plain &= trace.timing.free == problem.likelihood.channels[0].timing.free
         has_other_model = isinstance(likelihood.template, WithSkin) or len(tau) > 1
         has_other_model |= passes_direct_current(likelihood.template)
@@ -95,10 +95,9 @@ class RecordedDriveProblem(BatchProblem):
             return None
         delay = float(likelihood.to_physical(fitted.theta).get("delay", 0.0))
         origin = round(float(trace.timing.shift / trace.timing.step))
-        margin = MAX_DELAY if trace.timing.free else 0
-        shared = SharedFunctions.from_times(time, margin, float(tau[0]), origin)
+        shared = SharedFunctions.from_times(time, MAX_DELAY, float(tau[0]), origin)
         counted = np.flatnonzero(trace.samples.weights[: time.size] == 1.0)
-        if abs(origin) > MAX_DELAY - AGES or not np.array_equal(counted, np.arange(margin, time.size - margin)):
+        if abs(origin) > MAX_DELAY - AGES or not np.array_equal(counted, np.arange(MAX_DELAY, time.size - MAX_DELAY)):
             return None
         optional = tuple(name for name in problem.sources[0].optional_nuisances if name not in trace.timing.free)
         linear_sd = np.asarray(problem.likelihood.channels[0].linear_sd) / np.ptp(record["Vsc"])
@@ -144,7 +143,7 @@ class RecordedDriveProblem(BatchProblem):
             edges = edge_gain_sd(float(self.shared.time_step), tables.b) if self.unresolved else np.zeros(len(V))
             gain_sd = np.hypot(self.gain_sd, edges)
         inputs, optima = self._find_optima(tables, self.starting_points(tables.g, tables.b), screened, gain_sd)
-        raw = inputs._replace(table=self._select(tables.fields(in_functions=True)))
+        raw = inputs._replace(table=tables.fields(in_functions=True))
         optimum = _evaluate_optima(self.derive, self.likelihood, inputs, raw, optima.theta, optima.sigma)
         weight = self.derive.weight[: self.evaluated.stop - self.evaluated.start]
         contact = weight, self.derive.coefficient, self.derive.normal_force
@@ -214,7 +213,7 @@ class RecordedDriveProblem(BatchProblem):
         """Solve the least squares, and add nuisances to each record while the BIC favours one."""
         wide, floor = 10.0 * screened.height, MIN_RELATIVE_NOISE * screened.height  # as for a single record
         linear_sd, noise = self.linear_sd * screened.height[:, None], np.maximum(screened.noise, floor)
-        fields, clock = self._select(tables.fields()), np.zeros(tables.coordinates.shape[1])
+        fields, clock = tables.fields(), np.zeros(tables.coordinates.shape[1])
         tolerance = self.settings.first_tolerance
         while True:
             inputs = RecordInputs(fields, linear_sd, floor, gain_sd, tables.g)
@@ -229,10 +228,6 @@ class RecordedDriveProblem(BatchProblem):
                 return inputs, optima
             start, noise = optima.theta, optima.sigma  # near the next optimum
             tolerance = self.settings.loop_tolerance
-
-    def _select(self, fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the fields of compressions, without steps if no delay is fitted."""
-        return fields if self.likelihood.channels[0].timing.free else fields | {"steps": fields["steps"][:, :0]}
 
     def _nuisance_names(self, is_free: Bool[np.ndarray, " nuisances"]) -> str:
         """Return the names of the nuisances that were fitted, as in `Fit.model`."""

@@ -17,14 +17,7 @@ from fitact.data.record import Record
 from fitact.errors import InputError
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
-from fitact.likelihood.observable import (
-    CHARGES,
-    FIRST_CHARGE,
-    LINEAR_NUISANCES,
-    ChannelInputs,
-    ElectricalSignal,
-    charge_decays,
-)
+from fitact.likelihood.observable import CHARGES, FIRST_CHARGE, LINEAR_NUISANCES, ChannelInputs, charge_decays
 from fitact.model.circuit import Circuit, charge_ratios
 from fitact.model.drive import Drive, Multitone, Periodic, PiecewiseLinear, Sampled, Sine
 from fitact.model.force import Geometry, electrostatic_force, friction, mean_force, peak_force, summarize
@@ -219,11 +212,11 @@ def derived_from_fit(
 ) -> DerivedQuantities:
     """Return the derived quantities of a fit, from its first record and drive; `b` is its slowest time constant (s).
 
-    The drive is without its noise if the likelihood knows it so.
+    The drive is without its noise if the likelihood responds to it so.
     """
-    drive, observable = choice.drive, likelihood.channels[0].observable
-    if isinstance(drive, Sampled) and isinstance(observable, ElectricalSignal) and observable.smooth is not None:
-        drive = dataclasses.replace(drive, samples=observable.smooth)
+    drive, channel = choice.drive, likelihood.channels[0]
+    if isinstance(drive, Sampled) and channel.shifts_response and channel.electrical.smooth is not None:
+        drive = dataclasses.replace(drive, samples=channel.electrical.smooth)
     last = None if isinstance(likelihood.template, WithSkin) else _last_periods(record, drive, b)
     # the peak for a frequency-dependent skin is taken half a step after an ideal jump
     jump_delay = 0.5 * record.time_step if isinstance(likelihood.template, WithSkin) else 0.0

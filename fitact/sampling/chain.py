@@ -41,7 +41,7 @@ class Chain:
     def thinning_slice(self, burn: int, n_points: int) -> slice:
         """Return equally spaced steps from the burn-in to the last, with about `n_points` points per ensemble."""
         n_steps = self.steps - burn
-        spacing = max(1, -(-n_steps * self.points.shape[2] // n_points))
+        spacing = max(1, round(n_steps * self.points.shape[2] / n_points))
         return slice(burn + (n_steps - 1) % spacing, None, spacing)
 
     def extend(self, new_steps: list[tuple[np.ndarray, np.ndarray, emcee.State, np.ndarray]]) -> None:

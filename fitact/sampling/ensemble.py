@@ -56,8 +56,8 @@ def sample(
       it is refused above a tenth of a standard deviation.
     - "psis": draws from a Student-t around the fit, with Pareto-smoothed importance weights, resampled systematically
       to equal weights. It is refused where Pareto k-hat is above 0.7.
-    - "emcee": MCMC, run until converged. Nine moves in ten propose from the same Student-t. The tenth is a stretch
-      move, which samples posteriors of any other shape. The chain has converged when each ensemble is longer
+    - "emcee": MCMC, run until converged. Most moves (85 %) propose from the same Student-t. The others are
+      stretch moves, which sample posteriors of any other shape. The chain has converged when each ensemble is longer
       than 50 autocorrelation times and split-R-hat over the ensembles is below 1.01, for every coordinate, g, b and
       the mean force, and no walker is stuck.
 
@@ -127,7 +127,7 @@ def run_ensembles(
     return run.chain, convergence
 
 
-def make_moves(proposal: Proposal, independent: float = 0.9) -> list[tuple[emcee.moves.Move, float]]:
+def make_moves(proposal: Proposal, independent: float = 0.85) -> list[tuple[emcee.moves.Move, float]]:
     """Return emcee's moves with their weights: a fraction `independent` draws from the proposal, others stretch."""
     return [(emcee.moves.MHMove(proposal.move), independent), (emcee.moves.StretchMove(), 1.0 - independent)]
 

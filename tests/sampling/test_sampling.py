@@ -118,7 +118,7 @@ def test_interrupted_sampling_keeps_what_there_is(finger_fit: fitact.Fit, tmp_pa
 
     def interrupted(self, *args, **kwargs):
         calls.append(1)
-        if len(calls) == 40:  # of about 80 calls: 1 in 10 of 200 steps of 4 ensembles
+        if len(calls) == 60:  # of about 120 calls: 3 in 20 of 200 steps of 4 ensembles
             signal.raise_signal(signal.SIGINT)
         return step(self, *args, **kwargs)
 
