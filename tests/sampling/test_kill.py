@@ -43,7 +43,7 @@ def test_kills_lose_nothing_that_was_saved(least: int, finger_path: Path, finger
     path, out = tmp_path / "results" / "chain.h5", tmp_path / "results" / "posterior.nc"
     arguments = [SAMPLE.format(steps=STEPS), finger_path, finger_scene_path, path, out]
     command = [sys.executable, "-c", *map(str, arguments)]
-    before, points = 0, np.empty((0, 32, 4))
+    before, points = 0, np.empty((0, 32, 5))
     kills = random.Random(0)
     for kill in range(10):
         if kill >= least and before > 0:
