@@ -95,7 +95,7 @@ class RecordedDriveProblem(BatchProblem):
             return None
         delay = float(likelihood.to_physical(fitted.theta).get("delay", 0.0))
         origin = round(float(trace.timing.shift / trace.timing.step))
-        shared = SharedFunctions.from_times(time, MAX_DELAY, float(tau[0]), origin)
+        shared = SharedFunctions.from_times(time, float(tau[0]), origin)
         counted = np.flatnonzero(trace.samples.weights[: time.size] == 1.0)
         if abs(origin) > MAX_DELAY - AGES or not np.array_equal(counted, np.arange(MAX_DELAY, time.size - MAX_DELAY)):
             return None

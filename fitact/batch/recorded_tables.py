@@ -40,7 +40,7 @@ class SharedFunctions(NamedTuple):
     """Functions of time that all records share: offset, drift, hum, and the decays of unknown charges.
 
     Attributes:
-        functions: orthonormal over the fitted samples, which are all but `margin` at both ends; known at all.
+        functions: orthonormal over the fitted samples, which are all but `MAX_DELAY` at both ends; known at all.
         is_fitted: 1 at the samples of the drive to which the fitted ones respond, and 0 at others.
         fitted_functions: the functions at the times of the responses to these, and 0 at others.
         baseline: coordinates of the shapes of `BASELINE_NAMES`.
@@ -51,7 +51,6 @@ class SharedFunctions(NamedTuple):
     """
 
     functions: Float[Array, "shared samples"]
-    margin: int
     is_fitted: Float[Array, " samples"]
     fitted_functions: Float[Array, "shared samples"]
     baseline: Float[Array, "shapes shared"]
@@ -61,25 +60,25 @@ class SharedFunctions(NamedTuple):
     origin: Int[Array, ""]
 
     @classmethod
-    def from_times(cls, time: Float[np.ndarray, " samples"], margin: int, tau: float, origin: int) -> Self:
+    def from_times(cls, time: Float[np.ndarray, " samples"], tau: float, origin: int) -> Self:
         """Return the functions at uniform times (s), for time constants around `tau` (s).
 
-        `margin` samples at both ends are not fitted.
+        `origin` is as in the attributes.
         """
         x, to_series = chebyshev(NODES)
         decays = np.exp(-(time - time[0])[:, None] / (tau * np.exp(TABLE_HALF_WIDTH * x)))
         middle, half = 0.5 * (time[0] + time[-1]), 0.5 * (time[-1] - time[0])
         shapes = np.column_stack([evaluate_baseline(time, middle, half).T, decays])
-        _, sizes, modes = np.linalg.svd(shapes[margin : time.size - margin], full_matrices=False)
+        _, sizes, modes = np.linalg.svd(shapes[MAX_DELAY:-MAX_DELAY], full_matrices=False)
         # a charge is no larger than the drive, and needs fewer digits
         rank = np.count_nonzero(sizes > 1e-10 * sizes[0])
         baseline, decay = np.split(sizes[:rank, None] * modes[:rank], [len(BASELINE_NAMES)], axis=1)
         functions, step = modes[:rank] / sizes[:rank, None] @ shapes.T, (time[-1] - time[0]) / (time.size - 1)
         is_fitted = np.zeros(time.size)
-        is_fitted[margin - origin : time.size - margin - origin] = 1.0
+        is_fitted[MAX_DELAY - origin : time.size - MAX_DELAY - origin] = 1.0
         fitted_functions = is_fitted * np.roll(functions, -origin, axis=1)
         numbers = np.asarray(math.log(tau)), np.asarray(step), np.asarray(origin)
-        return cls(functions, margin, is_fitted, fitted_functions, baseline.T, decay @ to_series.T, *numbers)
+        return cls(functions, is_fitted, fitted_functions, baseline.T, decay @ to_series.T, *numbers)
 
     @property
     def size(self) -> int:
@@ -88,7 +87,7 @@ class SharedFunctions(NamedTuple):
 
     def select_fitted(self, values: Float[Array, " samples"]) -> Float[Array, " used"]:
         """Return values at the times of the drive at the fitted samples, delayed by `origin`."""
-        return lax.dynamic_slice(values, (self.margin - self.origin,), (values.size - 2 * self.margin,))
+        return lax.dynamic_slice(values, (MAX_DELAY - self.origin,), (values.size - 2 * MAX_DELAY,))
 
     def decay_polynomials(self, tau: Float[Array, " nodes"]) -> Float[Array, "terms nodes"]:
         """Return the polynomials in log tau whose coefficients are in `decay`."""
