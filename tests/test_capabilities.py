@@ -1,5 +1,6 @@
 """Each cell of the table of what works where, and the table in the documentation."""
 
+import dataclasses
 import functools
 import itertools
 from pathlib import Path
@@ -35,6 +36,13 @@ def test_a_cell_works_or_is_refused(
         assert "\n" not in str(refusal.value)
         return
     errors = FUNCTIONS[name](row, tmp_path)
+    assert max(map(abs, errors.values())) < MAX_ERROR, errors
+
+
+def test_a_track_follows_the_current_alone_with_a_body_resistance(tmp_path: Path) -> None:
+    """A window whose first channel is I has no table of the time constant that makes I later."""
+    (row,) = (row for row in CAPABILITIES if row.name == "body resistance R_H, Vsc and I")
+    errors = FUNCTIONS["track"](dataclasses.replace(row, channels=("I",)), tmp_path)
     assert max(map(abs, errors.values())) < MAX_ERROR, errors
 
 

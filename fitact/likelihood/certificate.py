@@ -131,7 +131,7 @@ def reason_against_table(
         return "a dispersive skin has no time constants" if start.circuit.grid is None else ""
     if channel.shifts_response and not _can_delay(channel):
         return _TIMING_REASON
-    tau = start.tau[: start.tau.size - channel.count_short(start.tau) - channel.electrical.lags]
+    tau = start.tau[: start.tau.size - channel.count_untabulated(start.tau)]
     if not tau.size:
         return "the time constants of the circuit are far below the time step"
     if table_multiple(tau) > max_multiple:

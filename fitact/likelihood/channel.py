@@ -88,6 +88,10 @@ class ChannelLikelihood(eqx.Module):
             return 0
         return int(np.count_nonzero(np.asarray(tau) < SHORT_TAU * self.timing.step))
 
+    def count_untabulated(self, tau: Float[np.ndarray, " terms"]) -> int:
+        """Return how many of the time constants (s), the fastest, are in no table: short ones, and lags of I."""
+        return self.count_short(tau) + self.electrical.lags
+
     def qualified_name(self, name: str) -> str:
         """Return the name of a nuisance, followed by the channel's label if there are several channels."""
         return f"{name}_{self.label}" if self.label else name

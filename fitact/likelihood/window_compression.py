@@ -82,8 +82,7 @@ class WindowCompressor:
 
         `noise_V` is the sd of the noise of V, to which a channel whose response may be delayed does not respond.
         """
-        time, first = step * np.arange(samples), channels[0]
-        short = first.count_short(circuit.tau) + first.electrical.lags
+        time, short = step * np.arange(samples), channels[0].count_untabulated(circuit.tau)
         is_single = circuit.tau.size - short == 1
         reach = (math.log(REACH), count_nodes(math.log(REACH), 1e-8)) if is_single else None
         tables, shared = [], []

@@ -231,7 +231,7 @@ def require_table(model: WindowModel, source: str) -> None:
     likelihood = model.fit.likelihood
     circuit = likelihood.evaluate_circuit(model.fit.theta)
     reasons = [reason_against_table(each, circuit, TOLERANCE) for each in likelihood.channels]
-    if len({each.count_short(circuit.tau) + each.electrical.lags for each in likelihood.channels}) > 1:
+    if len({each.count_untabulated(circuit.tau) for each in likelihood.channels}) > 1:
         reasons.append("a time constant is far below the time step, and the delay of Vsc is not a free parameter")
     if reason := next(filter(None, reasons), ""):
         raise InputError(

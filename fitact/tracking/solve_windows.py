@@ -125,9 +125,9 @@ def _fit_alone(
         theta = np.where((windows.has_data & finite)[:, None], theta + step, theta)
     ratio = linear.squares / _counts(windows)
     usual = np.median(ratio[windows.has_data], axis=0)
-    table = windows.data.compressions[0]
-    tau = np.asarray(likelihood.time_constants(theta))
-    covered = np.all(np.abs(np.log(tau[: len(tau) - table.short]) - table.center) <= table.half_width, axis=0)
+    tau, table = np.asarray(likelihood.time_constants(theta)), windows.data.compressions[0]
+    tau = tau[: len(tau) - table.short - likelihood.channels[0].electrical.lags]  # those of the table
+    covered = np.all(np.abs(np.log(tau) - table.center) <= table.half_width, axis=0)
     fits = np.all(ratio < max_ratio * usual, axis=1) & finite & covered
     kept = windows.has_data & fits
     theta = np.where(kept[:, None], theta, np.median(theta[kept], axis=0))
