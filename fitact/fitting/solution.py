@@ -1,8 +1,9 @@
 """Optimum of a problem: fits with compression, until effects of instruments and weights of spectra no longer change."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
+from jaxtyping import Float
 
 from fitact.fitting.instrument_effects import effects_would_change, fill_effects
 from fitact.fitting.least_squares import LeastSquaresResult, solve
@@ -10,6 +11,7 @@ from fitact.fitting.multistart import choose_start
 from fitact.fitting.row_updates import update_rows
 from fitact.fitting.timing import shift_whole_steps, start_delays
 from fitact.likelihood import certificate
+from fitact.likelihood.likelihood import Likelihood
 from fitact.problem.build import Problem
 from fitact.problem.spectra import update_weights
 
@@ -30,28 +32,30 @@ def solve_problem(
     by more than `max_change` standard errors. It does not go on after `max_steps` of the search, of which a model that
     is wrong may need many. A current with a recorded drive that has not settled ends with its most probable fit.
     A delay that is known to a tenth of a step may change without end, by up to half a step, if the other parameters
-    follow it by less than a twentieth of a standard error.
+    follow it by less than a twentieth of a standard error. Tables are verified at the end; the samples of channels
+    whose table fails are summed from there on.
     """
     noise, theta = [source.noise for source in problem.sources], choose_start(problem, start)
-    likelihood, end, best, steps = problem.likelihood, None, None, 0
+    likelihood, best, steps = problem.likelihood, None, 0
+    full: dict[int, str] = {}  # channels whose table has failed, and why
     has_rows = any(channel.samples.charges is not None for channel in likelihood.channels)
     for round_number in range(max_rounds):
         before, likelihood = theta, fill_effects(likelihood, theta, noise, problem.sources)
-        checked = not has_rows or round_number > 0
         problem = problem._replace(likelihood=likelihood)
-        likelihood, reasons = problem.compress_likelihood(tolerance)  # what does not change stays compressed
+        likelihood, reasons = problem.compress_likelihood(tolerance, full)  # what does not change stays compressed
         likelihood = start_delays(likelihood, theta) if round_number == 0 else likelihood
-        end = _solve_with_effects(problem._replace(likelihood=likelihood), reasons, tolerance, theta, checked)
-        places = [end[0].likelihood.names.index(name) for name in likelihood.names]
-        theta, steps = end[0].theta[places], steps + end[0].steps
-        if has_rows and checked and (best is None or end[0].log_density > best[0].log_density):
-            best = end
-        is_settled = effects_would_change(likelihood, before, theta, end[0].sigma) <= max_change
+        problem = problem._replace(likelihood=likelihood)
+        solved = _solve(problem, tolerance, full, theta)
+        root, places = solved.covariance_factor(), _find_places(solved, likelihood)
+        theta, steps = solved.theta[places], steps + solved.steps
+        if best is None or not has_rows or solved.log_density > best[2].log_density:
+            best = problem, reasons, solved
+        is_settled = effects_would_change(likelihood, before, theta, solved.sigma) <= max_change
         if is_settled:
-            influences = [jacobian @ end[2] for jacobian in end[0].jacobian]
+            influences = [jacobian @ root for jacobian in solved.jacobian]
             likelihood, change = update_weights(likelihood, theta, problem.sources, influences)
             is_settled = change <= 1e-3
-        sd = np.linalg.norm(end[2][places], axis=1)
+        sd = np.linalg.norm(root[places], axis=1)
         shifted, theta = shift_whole_steps(likelihood, theta, sd)
         is_settled, likelihood = is_settled and shifted is likelihood, shifted
         if has_rows:
@@ -59,38 +63,61 @@ def solve_problem(
             skew = np.max(np.abs(theta), where=likelihood.follows_rows, initial=0.0)
             others = np.max(moved, where=~likelihood.follows_rows, initial=0.0)
             is_still = (skew <= max_skew and np.max(moved) <= max_change) or (skew <= 0.5 and others <= 0.05)
-            is_settled = is_settled and checked and is_still
-            if not is_settled:
-                likelihood = update_rows(likelihood, end[0], problem.sources)
-                theta = np.where(likelihood.follows_rows, 0.0, theta)  # their delays have moved into the rows
-        if is_settled or (checked and steps > max_steps):
+            is_settled = is_settled and round_number > 0 and is_still
+        if is_settled:
+            certified, failed = _certify(solved, reasons, tolerance)
+            if not failed:
+                return solved, certified, root
+            full, likelihood = full | failed, _decompress(likelihood, failed)
+        elif has_rows:
+            likelihood = update_rows(likelihood, solved, problem.sources)
+            theta = np.where(likelihood.follows_rows, 0.0, theta)  # their delays have moved into the rows
+        if steps > max_steps:
             break
-    assert end is not None
-    return end if is_settled or best is None else best
+    assert best is not None
+    problem, reasons, solved = best
+    certified, failed = _certify(solved, reasons, tolerance)
+    while failed:
+        theta, full = solved.theta[_find_places(solved, problem.likelihood)], full | failed
+        problem = problem._replace(likelihood=_decompress(problem.likelihood, failed))
+        solved = _solve(problem, tolerance, full, theta)
+        certified, failed = _certify(solved, certified.reasons, tolerance)
+    return solved, certified, solved.covariance_factor()
 
 
-def _solve_with_effects(
-    problem: Problem, reasons: tuple[str, ...], tolerance: float, theta_0: np.ndarray, checked: bool
-) -> tuple[LeastSquaresResult, certificate.CertifiedLikelihood, np.ndarray]:
-    """Fit with compression, and if that is `checked`, again without it where its error exceeds the tolerance.
+def _solve(
+    problem: Problem, tolerance: float, full: Mapping[int, str], theta: Float[np.ndarray, " parameters"]
+) -> LeastSquaresResult:
+    """Fit from `theta` on, without an interpolation of the channels whose samples are all summed (`full`)."""
+    reasons = [certificate.reason_against_compression(each, tolerance) for each in problem.likelihood.channels]
+    return solve(
+        problem.likelihood,
+        theta,
+        np.array([source.noise for source in problem.sources]),
+        tuple(source.optional_nuisances for source in problem.sources),
+        tuple(not reason and i not in full for i, reason in enumerate(reasons)),
+    )
+
+
+def _certify(
+    solved: LeastSquaresResult, reasons: tuple[str, ...], tolerance: float
+) -> tuple[certificate.CertifiedLikelihood, dict[int, str]]:
+    """Verify the compressions at a solution, and return also which failed, and why.
 
     `reasons` say why channels are not compressed.
     """
-    likelihood = problem.likelihood
-    noise = np.array([source.noise for source in problem.sources])
-    freeable = tuple(source.optional_nuisances for source in problem.sources)
-    interpolated = [not certificate.reason_against_compression(each, tolerance) for each in likelihood.channels]
-    while True:
-        solved = solve(likelihood, theta_0, noise, freeable, tuple(interpolated))
-        root = solved.covariance_factor()
-        if not checked:
-            return solved, certificate.CertifiedLikelihood(solved.likelihood, None, reasons), root
-        certified = certificate.certify(solved.likelihood, reasons, solved.theta, root, solved.sigma, tolerance)
-        pairs = zip(solved.likelihood.channels, certified.reasons, strict=True)
-        failed = [bool(reason) and channel.compression is not None for channel, reason in pairs]
-        if not any(failed):
-            return solved, certified, root
-        reasons = certified.reasons
-        for i in (i for i, each in enumerate(failed) if each):
-            interpolated[i] = False
-            likelihood = likelihood.replace_channel(i, likelihood.channels[i].without_compression())
+    root = solved.covariance_factor()
+    certified = certificate.certify(solved.likelihood, reasons, solved.theta, root, solved.sigma, tolerance)
+    pairs = enumerate(zip(solved.likelihood.channels, certified.reasons, strict=True))
+    return certified, {i: why for i, (channel, why) in pairs if why and channel.compression is not None}
+
+
+def _decompress(likelihood: Likelihood, channels: Iterable[int]) -> Likelihood:
+    for i in channels:
+        likelihood = likelihood.replace_channel(i, likelihood.channels[i].without_compression())
+    return likelihood
+
+
+def _find_places(solved: LeastSquaresResult, likelihood: Likelihood) -> list[int]:
+    """Return the places of a likelihood's parameters among those of a solution, which may have more."""
+    return [solved.likelihood.names.index(name) for name in likelihood.names]

@@ -219,11 +219,12 @@ class ChannelLikelihood(eqx.Module):
         assert charges is not None
         assert isinstance(electrical.drive, Sampled)
         total, rate = electrical.response_and_rate(inputs, electrical.drive.time)
+        falling, jump = electrical.falling_response(inputs, electrical.drive.time, total)
         if inputs.effects is not None:
             total = total + inputs.effects @ self.samples.effects / inputs.gain
-        functions = jnp.concatenate([total[None], self.shapes(inputs)[self._column_indices]])
-        signal, *shapes = charges.means(jnp.pad(functions, ((0, 0), (charges.reach, 0))))
-        later = signal - inputs.delay * jnp.diff(signal, prepend=signal[:1]) / self.timing.step  # a smooth signal
+        functions = jnp.concatenate([total[None], falling[None], self.shapes(inputs)[self._column_indices]])
+        signal, falling, *shapes = charges.means(jnp.pad(functions, ((0, 0), (charges.reach, 0))))
+        later = signal + inputs.delay * (falling - jump * charges.rate)
         if rate is not None:
             later = later + rate * (charges.rate - inputs.delay * charges.bend)
         remainder = charges.observed - inputs.gain * later

@@ -176,6 +176,15 @@ class ElectricalSignal(Observable):
             total, rate = response_and_rate(inputs.circuit, self.drive, time, **how)
         return total, rate if inputs.stray is None else (0.0 if rate is None else rate) + inputs.stray
 
+    def falling_response(self, inputs: ChannelInputs, time: Array, total: Array) -> tuple[Array, ArrayLike]:
+        """Return minus the derivative of a response `total` in time, beside the rise of the drive, and its gain."""
+        if isinstance(inputs.circuit, WithSkin):
+            return -jnp.diff(total, prepend=total[:1]) / self.timing.step, 0.0
+        terms = self.terms(inputs)
+        falling = terms._replace(weight=tuple(w / tau for w, tau in zip(terms.weight, terms.tau, strict=True)))
+        falling = falling._replace(rate=None, direct=None)
+        return superpose_terms(falling, self.drive, time, steady_state=self.steady_state), terms.jump
+
     def terms(self, inputs: ChannelInputs) -> HighpassTerms:
         """Return the terms of the channel over V, with the stray capacitance."""
         terms = self.select_terms(inputs.circuit.channel_terms(self.channel))

@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +20,7 @@ from fitact.instrument.classes import typical_gain_u
 from fitact.instrument.effects import INPUT_RANGE
 from fitact.likelihood import certificate
 from fitact.likelihood.channel import ChannelLikelihood
+from fitact.likelihood.charge_rows import MAX_STEPS
 from fitact.likelihood.compression import HUM_FREQUENCIES
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import Autoregression, estimate_quiet_noise, require_uniform
@@ -82,14 +83,18 @@ class Problem(NamedTuple):
     start: Float[np.ndarray, " circuit_parameters"]
     coordinates: tuple[ErrorCoordinate, ...]  # of the errors of instruments
 
-    def compress_likelihood(self, tolerance: float) -> tuple[Likelihood, tuple[str, ...]]:
-        """Return the likelihood with compressed channels, and why each of the others is not compressed, or ""."""
-        at_start = self.likelihood.evaluate_circuit(self.start)
-        pairs = [
-            (each, "") if each.compression is not None else certificate.compress_channel(each, at_start, tolerance)
-            for each in self.likelihood.channels
-        ]
-        channels, reasons = zip(*pairs, strict=True)
+    def compress_likelihood(self, tolerance: float, full: Mapping[int, str]) -> tuple[Likelihood, tuple[str, ...]]:
+        """Return the likelihood with compressed channels, and why each of the others is not compressed, or "".
+
+        `full` are channels that are to remain uncompressed, each with the reason.
+        """
+        at_start, found = self.likelihood.evaluate_circuit(self.start), []
+        for i, channel in enumerate(self.likelihood.channels):
+            if channel.compression is not None or i in full:
+                found.append((channel, full.get(i, "")))
+            else:
+                found.append(certificate.compress_channel(channel, at_start, tolerance))
+        channels, reasons = zip(*found, strict=True)
         return dataclasses.replace(self.likelihood, channels=channels), reasons
 
     def experiment(
@@ -390,7 +395,8 @@ def _make_charge_rows(
         # residuals of runs of equal values are no measure of the noise
         noise_floor=np.asarray(current.noise_I * (1.0 if current.is_coarse else 0.5)),
     )
-    usable = (lags > 0 or not limits_current(bare.template)) and not passes_direct_current(bare.template)
+    is_late = taus[-1] <= MAX_STEPS * record.time_step  # and no more than that
+    usable = (is_late or not limits_current(bare.template)) and not passes_direct_current(bare.template)
     return set_rows(channel, rows, V, 0.0), estimate if usable else None, current.noise_I, hum
 
 

@@ -176,6 +176,17 @@ def test_a_resistance_that_limits_the_current_for_part_of_a_step(R_H: float):
     assert np.max(found.sd[:3]) < 0.02
 
 
+def test_the_table_of_a_current_that_is_late_by_steps_is_the_sum_over_its_samples():
+    """Check 0.6 steps. With the rate of I from differences of samples, sum and table differed by 20."""
+    drive = {"waveform": "trapezoid", "peak_to_peak": 200.0, "frequency": 80.0, "rise_time": 200e-6, "phase": 0.1}
+    record = simulate_bench(drive, 14, 50e3, {"V": 0.1, "Vsc": 0.05, "I": 20e-9}, R_H := 20e3)
+    given = fitact.Scene.from_dict({**bench_scene(["I"]).model_dump(exclude_unset=True), "grounding": {"R_H": R_H}})
+    found = fitact.fit(record, given)
+    assert found.full_because == ""
+    assert found.compression_error < 1e-3
+    assert np.max(np.abs(errors(found))) < 4.0
+
+
 def test_hum_does_not_stand_in_for_a_tone_of_the_drive():
     """One tone is at the frequency of the mains, and the other alone does not determine three parameters."""
     tones = {"waveform": "multitone", "frequencies": [50.0, 350.0], "amplitudes": [75.0, 75.0], "phases": [1.0, 0.3]}
