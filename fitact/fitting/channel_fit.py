@@ -13,7 +13,7 @@ from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
 from fitact.fitting.residual_statistics import channel_statistics, outliers
 from fitact.likelihood.channel import ChannelLikelihood
-from fitact.likelihood.charge_rows import LAG, estimate_current_noise
+from fitact.likelihood.charge_rows import LAG, estimate_current_noise, mean_filter
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import STUDENT_DOF, student_weight
 from fitact.likelihood.observable import ChannelInputs
@@ -83,9 +83,9 @@ class ChannelFit:
         residuals, white, beta = sample_residuals(channel, inputs, np.asarray(sigma))
         samples, of_steps = channel.samples, None
         unpadded = slice(samples.size)
-        if samples.charges is not None:  # whose signal has the derivative of the noise of V
-            steps = float(channel.timing.shift) / float(channel.timing.step)
-            residuals = estimate_current_noise(samples.charges, np.asarray(white), steps)
+        if samples.has_drive_noise:
+            residuals = _current_residuals(channel, np.asarray(white))
+        if samples.charges is not None:
             of_steps = np.where(samples.likelihood_mask, white, np.nan)[unpadded]
             of_steps = np.append(of_steps[LAG:], np.full(LAG, np.nan))
         residuals, weight = residuals[unpadded], None if samples.equally_weighted else samples.weights[unpadded]
@@ -108,7 +108,7 @@ class ChannelFit:
             figures = channel_statistics(*whole, source.record, channel.channel, source.choice, b)
             figures |= of_rows
             figures |= _weighted_statistics(channel, residuals, weight, counted, source.record.time, source.noise)
-            if channel.samples.charges is not None:  # at edges and ends, samples of dV/dt are wrong, and rows are not
+            if samples.has_drive_noise:  # at edges and ends, samples of dV/dt are wrong, and rows are not
                 figures |= {"outliers": 0} | outliers(white, source.record.time[counted], source.noise)
         return cls(
             label=channel.label,
@@ -124,6 +124,18 @@ class ChannelFit:
             full_because=reason,
             white=of_steps,
         )
+
+
+def _current_residuals(channel: ChannelLikelihood, white: Samples) -> Samples:
+    """Return the part of the residuals of a current with a recorded V that is noise of I, and not of V, A."""
+    charges, whitening = channel.samples.charges, channel.samples.whitening
+    if charges is not None:
+        filtered = mean_filter(float(channel.timing.shift) / float(channel.timing.step))
+        gain, decay, used = (np.asarray(each) for each in (charges.gain, charges.decay, charges.used))
+        return estimate_current_noise(gain, decay, used * white, *filtered)
+    assert whitening is not None
+    gain, decay = np.asarray(whitening.gain), np.asarray(whitening.decay)
+    return estimate_current_noise(gain, decay, white, np.asarray(whitening.taps))
 
 
 def _weighted_statistics(
@@ -151,9 +163,7 @@ def _weighted_statistics(
 
 def _gain(optimum: CircuitValues, channel: ChannelLikelihood) -> float:
     """Return the factor by which noise of a measured drive enters the channel."""
-    if (
-        channel.channel == "Ft" or channel.samples.charges is not None
-    ):  # whose sensor hardly follows noise; which contain it
+    if channel.channel == "Ft" or channel.samples.has_drive_noise:  # whose sensor hardly follows noise; which have it
         return 0.0
     if isinstance(optimum.circuit, WithSkin):  # the gain falls with frequency, and most of the noise is fast
         return float(np.abs(_channel_gain(optimum.circuit, channel.channel, 1.0 / channel.timing.step)))
@@ -178,8 +188,8 @@ def _log_likelihood(
         if channel.noise == "student":
             return _student_log_likelihood(residuals, weights, sigma)
         return gaussian_log_likelihood(residuals, weights)
-    innovations = white_residuals / float(samples.whitening.taps[0])
-    return gaussian_log_likelihood(innovations, None) + float(np.sum(np.log(samples.weights[samples.likelihood_mask])))
+    scale = (samples.weights * samples.whitening.scale)[samples.likelihood_mask]
+    return gaussian_log_likelihood(white_residuals, None) + float(np.sum(np.log(scale)))
 
 
 def gaussian_log_likelihood(residuals: Samples, weight: Samples | None) -> float:

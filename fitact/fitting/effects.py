@@ -64,7 +64,7 @@ def channel_samples(laplace: Laplace, traces: Sequence[ChannelFit]) -> list[Chan
     return [
         _channel_samples(laplace, channel, fitted, taus)
         for channel, fitted in zip(laplace.likelihood.channels, traces, strict=True)
-        if fitted.channel != "Ft" and channel.samples.charges is None
+        if fitted.channel != "Ft" and not channel.samples.has_drive_noise
     ]
 
 

@@ -162,7 +162,9 @@ def _assemble_fit(
     if result == "misfit" and any(trace.channel != "Ft" for trace in poor):
         effects = assess_fit(laplace, traces, has_structure=True)
         # what a poor fit of the friction, or of a current with a recorded drive, may move is not assessed
-        assessed = {each.label for each in likelihood.channels if each.samples.charges is None and each.channel != "Ft"}
+        assessed = {
+            each.label for each in likelihood.channels if not each.samples.has_drive_noise and each.channel != "Ft"
+        }
         may_move = any(is_undersampled(trace.figures) or trace.label not in assessed for trace in poor)
         if effects is not None and not may_move and is_tolerable(effects, laplace, first.scene.tolerance.force):
             result = "structure"

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from fitact.compiled import jit, pad_samples
 from fitact.data.record import Record
+from fitact.fitting.channel_fit import sample_residuals
 from fitact.fitting.least_squares import LeastSquaresResult
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.charge_rows import MAX_STEPS, ChargeRows
@@ -17,6 +18,7 @@ from fitact.likelihood.compression import HUM_FREQUENCIES
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.observable import ChannelInputs
 from fitact.model.drive import Sampled
+from fitact.problem.limited_current import colour_noise, estimate_drive
 from fitact.problem.recorded_current import Current, RecordedCurrent, set_rows
 from fitact.problem.runs import Rows
 from fitact.problem.source import Source
@@ -28,6 +30,14 @@ def update_rows(likelihood: Likelihood, solution: LeastSquaresResult, sources: S
     for i, (channel, solved) in enumerate(zip(likelihood.channels, solution.likelihood.channels, strict=True)):
         # nuisances that were added stay: without them, the next fit leaves the optimum and returns by hundreds of steps
         channel = dataclasses.replace(channel, linear_sd=solved.linear_sd)
+        if channel.samples.charges is None and channel.samples.has_drive_noise:
+            inputs, record = (
+                solution.likelihood.make_inputs(optimum.circuit, solution.theta, solved),
+                sources[i].in_time,
+            )
+            white = sample_residuals(solved.without_compression(), inputs, np.asarray(solution.sigma[i]))[1]
+            channel = estimate_drive(channel.without_compression(), white, record)
+            channel = colour_noise(channel, optimum.terms[channel.channel], record)
         if channel.samples.charges is not None:
             inputs = solution.likelihood.make_inputs(optimum.circuit, solution.theta, solved)
             beta = np.asarray(_fit_nuisances(solved, inputs, np.asarray(solution.sigma[i]))[1])

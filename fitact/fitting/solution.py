@@ -38,7 +38,7 @@ def solve_problem(
     noise, theta = [source.noise for source in problem.sources], choose_start(problem, start)
     likelihood, best, steps = problem.likelihood, None, 0
     full: dict[int, str] = {}  # channels whose table has failed, and why
-    has_rows = any(channel.samples.charges is not None for channel in likelihood.channels)
+    has_rows = any(channel.samples.has_drive_noise for channel in likelihood.channels)
     for round_number in range(max_rounds):
         before, likelihood = theta, fill_effects(likelihood, theta, noise, problem.sources)
         problem = problem._replace(likelihood=likelihood)

@@ -294,7 +294,7 @@ def certify(
     differences -= np.where(is_expanded, differences[0], 0.0)
     errors = np.max(np.abs(differences)[: len(around)], axis=0)
     # far from the optimum, the error may grow with the difference in log-likelihood to the optimum
-    has_rows = np.array([channel.samples.charges is not None for channel in likelihood.channels])
+    has_rows = np.array([channel.samples.has_drive_noise for channel in likelihood.channels])
     relative = np.where(has_rows, 1e-3, 1e-6)
     excesses = np.nanmax(np.abs(tabulated - exact) - relative * np.abs(exact[0] - exact), axis=0, initial=-np.inf)
     excesses = np.where(is_expanded, errors, excesses)

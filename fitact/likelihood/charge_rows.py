@@ -35,13 +35,13 @@ def step_means(values: Float[np.ndarray, "*n samples"], delay: float = 0.0) -> F
 
     The step is taken `delay` time steps later, at most `MAX_STEPS` in either direction.
     """
-    taps, shift = _mean_filter(delay)
+    taps, shift = mean_filter(delay)
     result = np.zeros_like(values)
     result[..., shift:] = scipy.signal.lfilter(taps, [1.0], values[..., : values.shape[-1] - shift])
     return result
 
 
-def _mean_filter(delay: float) -> tuple[Float[np.ndarray, " taps"], int]:
+def mean_filter(delay: float) -> tuple[Float[np.ndarray, " taps"], int]:
     """Return the filter of `step_means`, and by how many samples its result is later."""
     whole = int(np.floor(delay))
     part = delay - whole
@@ -54,16 +54,17 @@ def _mean_filter(delay: float) -> tuple[Float[np.ndarray, " taps"], int]:
     return taps[used[1] : used[0] - 1 if used[0] else None : -1], LAG + 2 + _BEFORE - whole - int(used[1])
 
 
-def estimate_current_noise(rows: "ChargeRows", white: Float[np.ndarray, " samples"], delay: float) -> np.ndarray:
-    """Return the noise of each sample of I that is most probable for whitened residuals of the rows, A.
+def estimate_current_noise(
+    gain: np.ndarray, decay: np.ndarray, white: Float[np.ndarray, " samples"], taps: np.ndarray, shift: int = 0
+) -> Float[np.ndarray, " samples"]:
+    """Return the noise of each sample of I that is most probable for whitened residuals of rows, A.
 
     The rest of the residuals is noise of V. For normal noise it is the covariance of the sample with the rows, times
-    the inverse of their covariance, times the residuals. `delay` as in `step_means`.
+    the inverse of their covariance, times the residuals. `taps` and `shift` (`mean_filter`) make the rows of samples.
     """
-    gain, decay, used = (np.asarray(each) for each in (rows.gain, rows.decay, rows.used))
     bands = np.stack([np.ones_like(decay), -np.append(decay[1:], 0.0)])
-    summed, _ = scipy.linalg.lapack.dtbtrs(bands, (used * white)[:, None], uplo="L", trans="T", diag="U")
-    (taps, shift), noise = _mean_filter(delay), np.zeros(white.size)
+    summed, _ = scipy.linalg.lapack.dtbtrs(bands, white[:, None], uplo="L", trans="T", diag="U")
+    noise = np.zeros(white.size)
     noise[: white.size - shift] = scipy.signal.lfilter(taps, [1.0], (gain * summed[:, 0])[shift:][::-1])[::-1]
     return noise
 
@@ -108,9 +109,7 @@ class ChargeRows(eqx.Module):
         self, rows: Float[Array, "*shape samples"], before: Float[Array, "*shape"]
     ) -> Float[Array, "*shape samples"]:
         """Return whitened rows, where the whitened ones `before` the first are given."""
-        if rows.ndim > 1:
-            return jax.vmap(self.continue_whitening)(rows, before)
-        return recurrence(self.decay, self.gain * rows, before)
+        return continue_whitening(self.gain, self.decay, rows, before)
 
     def sample_rate(self) -> Float[Array, " samples"]:
         """Return dV/dt at the samples, over two steps, V/s."""
@@ -119,6 +118,15 @@ class ChargeRows(eqx.Module):
     def restrict(self, samples: slice) -> "ChargeRows":
         """Return some of the rows."""
         return jax.tree.map(lambda leaf: leaf[samples], self)
+
+
+def continue_whitening(
+    gain: Float[Array, " rows"], decay: Float[Array, " rows"], rows: Float[Array, "*n rows"], before: Float[Array, "*n"]
+) -> Float[Array, "*n rows"]:
+    """Return w[k] = gain[k] rows[k] + decay[k] w[k - 1], where w[-1] is `before`."""
+    if rows.ndim > 1:
+        return jax.vmap(lambda row, last: continue_whitening(gain, decay, row, last))(rows, before)
+    return recurrence(decay, gain * rows, before)
 
 
 class RowCovariance:

@@ -1,5 +1,6 @@
 """Noise models other than white Gaussian noise: Student-t noise, and coloured noise with a whitening filter."""
 
+import dataclasses
 import math
 from typing import Any, Literal, NamedTuple, TypeAlias
 
@@ -8,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from fitact.data.clipping import longest_run
 from fitact.data.record import STATE_RATE, Record, is_uniform
 from fitact.errors import InputError
+from fitact.likelihood.charge_rows import RowCovariance, continue_whitening, whiten_rows
 from fitact.model.response_table import chebyshev, chebyshev_polynomials
 
 NoiseModel: TypeAlias = Literal["white", "student", "ar1", "spectrum"]
@@ -102,29 +104,86 @@ def fit_student_scale(residuals: Float[np.ndarray, " samples"], counted: float) 
 
 
 class Whitening(eqx.Module):
-    """A whitening filter that preserves the standard deviation of the noise."""
+    """A whitening filter that preserves the standard deviation of the noise, and may go on as a recursion.
+
+    With the recursion, whitened value k is gain[k] times the filtered one + decay[k] times the whitened one before it.
+    """
 
     taps: Float[Array, " taps"]  # for the sample itself, the one before it, and so on
     mask: Float[Array, " samples"]  # 1 if a sample and all earlier samples within the filter are valid, else 0
+    gain: Float[Array, " samples"] | None = None
+    decay: Float[Array, " samples"] | None = None
+
+    @classmethod
+    def from_moving_average(
+        cls,
+        taps: Float[np.ndarray, "2"],
+        variance: Float[np.ndarray, " samples"],
+        neighbours: Float[np.ndarray, " samples"],
+        excluded: Bool[np.ndarray, " samples"],
+        unit: float,
+        group: Int[np.ndarray, " samples"] | None = None,
+        common: ArrayLike = 0.0,
+    ) -> "Whitening":
+        """Return the filter of noise that `taps` make a moving average, without the samples that are excluded.
+
+        It has then this variance, and covariances with the value before; it is whitened to the standard deviation
+        `unit`.
+        """
+        lost = excluded | np.append(True, excluded[:-1])
+        covariance = RowCovariance(variance, neighbours, lost, group, common)
+        return cls(taps, covariance.used * 1.0, *covariance.recursion(unit))
+
+    def begin(self, excluded: Bool[np.ndarray, " samples"]) -> "Whitening":
+        """Return the filter without a recursion for other samples, some of which are excluded."""
+        taps = np.asarray(self.taps)
+        whitening = Whitening(taps, np.where(np.arange(excluded.size) < taps.size - 1, 0.0, 1.0))
+        return whitening.exclude(excluded) if excluded.any() else whitening
 
     def __call__(self, values: Float[Array, "*shape samples"]) -> Float[Array, "*shape samples"]:
         """Return the filtered values, with 0 where `mask` is 0."""
-        return self.filter(jnp.pad(values, [(0, 0)] * (values.ndim - 1) + [(self.taps.size - 1, 0)]))
+        around = jnp.pad(values, [(0, 0)] * (values.ndim - 1) + [(self.taps.size - 1, 0)])
+        return self.mask * self.filter(around, jnp.zeros(values.shape[:-1]))
+
+    @property
+    def scale(self) -> np.ndarray:
+        """Factor of each sample in its own whitened value."""
+        return np.abs(float(self.taps[0])) * np.asarray(1.0 if self.gain is None else self.gain)
+
+    def inverse_power(self, cycles: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Return the power of noise that becomes white with sigma = 1, at frequencies in cycles per sample."""
+        turns = np.exp(-2j * np.pi * np.outer(cycles, np.arange(self.taps.size)))
+        power = np.abs(turns @ np.asarray(self.taps)) ** -2.0
+        if self.gain is None or self.decay is None:
+            return power
+        return power * np.abs((1.0 - float(np.median(self.decay)) * turns[:, 1]) / float(np.median(self.gain))) ** 2
 
     def exclude(self, excluded: Bool[np.ndarray, " samples"]) -> "Whitening":
         """Return the filter without the samples that it computes from an excluded one."""
         mask, taps = np.asarray(self.mask), np.trim_zeros(np.asarray(self.taps), "b")
-        return Whitening(self.taps, np.where(np.convolve(excluded, np.ones(taps.size))[: mask.size] > 0.5, 0.0, mask))
+        mask = np.where(np.convolve(excluded, np.ones(taps.size))[: mask.size] > 0.5, 0.0, mask)
+        return dataclasses.replace(self, mask=mask)
 
     def restrict(self, samples: slice) -> "Whitening":
         """Return the filter for some of the samples."""
-        return Whitening(self.taps, self.mask[samples])
+        recursion = () if self.gain is None or self.decay is None else (self.gain[samples], self.decay[samples])
+        return Whitening(self.taps, self.mask[samples], *recursion)
 
-    def filter(self, values: Float[Array, "*shape reach+samples"]) -> Float[Array, "*shape samples"]:
-        """Return the same for values that include those within the filter's reach before the samples."""
+    def filter(
+        self, values: Float[Array, "*shape reach+samples"], before: Float[Array, "*shape"]
+    ) -> Float[Array, "*shape samples"]:
+        """Return filtered values, without the mask, from those that include the filter's reach before the samples.
+
+        `before` are the whitened values before the first, which a recursion needs.
+        """
         reach, size = self.taps.size - 1, self.mask.size
         parts = [self.taps[lag] * values[..., reach - lag : reach - lag + size] for lag in range(reach + 1)]
-        return self.mask * sum(parts[1:], parts[0])
+        filtered = sum(parts[1:], parts[0])
+        if self.gain is None or self.decay is None:
+            return filtered
+        if isinstance(filtered, np.ndarray):
+            return whiten_rows(self.gain, self.decay, filtered)
+        return continue_whitening(self.gain, self.decay, filtered, before)
 
 
 def draw_noise(
@@ -136,7 +195,7 @@ def draw_noise(
     if whitening is None:
         return rng.standard_normal(shape)
     around = 4 * shape[-1]  # noise is drawn on a circle that is longer than its correlations
-    power = np.abs(np.fft.fft(np.asarray(whitening.taps), around * stride)) ** -2.0
+    power = whitening.inverse_power(np.fft.fftfreq(around * stride))
     power = power.reshape(stride, around).mean(axis=0)  # subsampling folds the spectrum
     lines = np.fft.fft(rng.standard_normal((*shape[:-1], around))) * np.sqrt(power)
     return np.fft.ifft(lines).real[..., : shape[-1]]

@@ -64,6 +64,11 @@ class PaddedSamples(eqx.Module):
         return self.time.size if self.weight is None else array_module(self.weight).count_nonzero(self.weight)
 
     @property
+    def has_drive_noise(self) -> bool:
+        """Whether their noise contains that of a recorded V, as that of a current does."""
+        return self.charges is not None or (self.whitening is not None and self.whitening.gain is not None)
+
+    @property
     def middle_and_half(self) -> tuple[Array, Array]:
         """Middle of the record, and half its length, s."""
         return 0.5 * (self.time[0] + self.time[-1]), 0.5 * (self.time[-1] - self.time[0])

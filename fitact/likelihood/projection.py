@@ -100,6 +100,7 @@ def compress(
         effects = voltage if effects is None else np.concatenate([effects, voltage])
     one = np.ones(time.size) if weight is None else np.asarray(weight)
     mask = one if whitening is None else np.asarray(whitening.mask)[: time.size]
+    recursion = None if whitening is None or whitening.gain is None else (whitening.gain, whitening.decay)
     if charges is not None:
         observed, rate, slope, mask = charges.observed, charges.rate, charges.bend, charges.used
     samples = Samples(
@@ -112,6 +113,7 @@ def compress(
         student,
         effects,
         charges,
+        recursion,
     )
     taps = None if whitening is None else np.asarray(whitening.taps)
     measured = isinstance(drive, Sampled) and not steady_state
@@ -241,6 +243,7 @@ class Samples(NamedTuple):
     student: np.ndarray | None = None  # as in `compress`
     effects: np.ndarray | None = None  # likewise
     charges: ChargeRows | None = None  # of a current; `observed`, `rate` and `slope` are then rows
+    recursion: Any = None  # gain and decay of the whitening filter
 
     @property
     def n_effects(self) -> int:
@@ -283,7 +286,7 @@ class WhiteningState(NamedTuple):
 
     taps: np.ndarray | None  # None for the rows of charges
     last: Float[np.ndarray, "functions reach"]  # values before the chunk
-    whitened: Float[np.ndarray, " functions"] | None = None  # last whitened row of each function, of charges
+    whitened: Float[np.ndarray, " functions"] | None = None  # last whitened value of each function
 
     @classmethod
     def start(
@@ -291,7 +294,7 @@ class WhiteningState(NamedTuple):
     ) -> "WhiteningState | None":
         if charges is not None:  # rate, slope and record are rows; the expected signal is a function of time, too
             return cls(None, np.zeros((functions - 2, charges.reach)), np.zeros(functions))
-        return None if taps is None else cls(taps, np.zeros((functions, taps.size - 1)))
+        return None if taps is None else cls(taps, np.zeros((functions, taps.size - 1)), np.zeros(functions))
 
 
 def _chunk_products(
@@ -368,8 +371,9 @@ def whitened_products(
         return jnp.hstack([(rows * chunk.student[0]) @ rows.T, rows @ chunk.student[1:].T]), filtering
     if filtering is not None:
         around = jnp.concatenate([filtering.last, rows], axis=1)
-        rows = Whitening(filtering.taps, chunk.mask).filter(around)
-        filtering = WhiteningState(filtering.taps, around[:, rows.shape[1] :])
+        whitened = Whitening(filtering.taps, chunk.mask, *(chunk.recursion or ())).filter(around, filtering.whitened)
+        rows = chunk.mask * whitened
+        filtering = WhiteningState(filtering.taps, around[:, rows.shape[1] :], whitened[:, -1])
     return rows @ rows.T, filtering
 
 
@@ -438,7 +442,7 @@ def _accumulate_measured(
     last = np.zeros(table.nodes.size), np.asarray(time[0]), np.zeros(())  # the first sample is a jump from 0
     if x is not None:
         last = first * np.exp(x), np.asarray(time[0] - step), np.asarray(first)
-    voltages = chunks(samples._replace(observed=voltage, effects=None, charges=None), length)
+    voltages = chunks(samples._replace(observed=voltage, effects=None, charges=None, recursion=None), length)
     advance = jit(_advance_chunk, fast=time.size > MANY_SAMPLES)
     for number, (chunk, driven) in enumerate(zip(chunks(samples, length), voltages, strict=True)):
         steps = np.empty((0, length))

@@ -166,7 +166,7 @@ class WindowCompressor:
         else:
             rate, slope, observed = np.zeros(late.size), np.gradient(functions[-2], step), given
             fitted = channel.samples.whitening
-            whitening = None if fitted is None else _make_filter(fitted, weight, late.size)
+            whitening = fitted and fitted.begin(np.zeros(late.size, bool) if weight is None else weight == 0.0)
             used = weight if whitening is None else whitening.mask
             count = late.size if used is None else int(np.count_nonzero(used))
         rest = observed - functions[-1] - (0.0 if table.expected_rate is None else table.expected_rate * rate)
@@ -232,7 +232,8 @@ class WindowProducts(NamedTuple):
         if charges is not None:
             rows = whiten_rows(charges.gain, charges.decay, rows) * charges.used
         elif whitening is not None:
-            rows = whitening.filter(np.pad(rows, [(0, 0), (whitening.taps.size - 1, 0)]))
+            around = np.pad(rows, [(0, 0), (whitening.taps.size - 1, 0)])
+            rows = whitening.mask * whitening.filter(around, np.zeros(len(rows)))
         return cls({name: len(each) for name, each in functions.items()}, rows @ rows.T)
 
 
@@ -243,13 +244,6 @@ def _find_coordinates(products: WindowProducts, sizes: Mapping[str, int]) -> dic
     kept, there = map(np.concatenate, zip(*pairs, strict=True))
     total[np.ix_(kept, kept)] = products.values[np.ix_(there, there)]
     return split_functions(factor_products(total)[0], sizes)
-
-
-def _make_filter(fitted: Whitening, weight: Samples | None, samples: int) -> Whitening:
-    """Return the filter of the fitted window for another one, which begins without the samples before it."""
-    taps = np.asarray(fitted.taps)
-    whitening = Whitening(taps, np.where(np.arange(samples) < taps.size - 1, 0.0, 1.0))
-    return whitening if weight is None else whitening.exclude(weight == 0.0)
 
 
 def _decays(table: TableNodes, time: Samples) -> Float[np.ndarray, "rank samples"]:

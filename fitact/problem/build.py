@@ -56,6 +56,7 @@ from fitact.problem.instrument_errors import (
     collect_coordinates,
     largest_gain,
 )
+from fitact.problem.limited_current import colour_noise
 from fitact.problem.recorded_current import Current, RecordedCurrent, estimate_noise, set_rows
 from fitact.problem.runs import long_run_share
 from fitact.problem.skin_model import apply_skin_model, count_harmonics, exclude_jumps, require_skin_response
@@ -184,19 +185,26 @@ def build_problem(
         sigma_prior=tuple(noise.get(f"sigma_{each.letter}".rstrip("_")) for each in channels),
         use_prior=use_prior,
     )
-    likelihood = _set_noise_gains(likelihood, likelihood.prior.log_mean)
+    likelihood = _set_drive_noise(likelihood, likelihood.prior.log_mean, sources)
     start = start_from_estimates(likelihood, [source.start for source in sources])
-    return Problem(_set_noise_gains(likelihood, start), tuple(sources), start, coordinates)
+    return Problem(_set_drive_noise(likelihood, start, sources), tuple(sources), start, coordinates)
 
 
-def _set_noise_gains(likelihood: Likelihood, theta: Float[np.ndarray, " circuit_parameters"]) -> Likelihood:
-    """Return the likelihood in which the noise of recorded drives has the gains of the circuit at theta."""
+def _set_drive_noise(
+    likelihood: Likelihood, theta: Float[np.ndarray, " circuit_parameters"], sources: Sequence[Source]
+) -> Likelihood:
+    """Return the likelihood in which the noise of recorded drives is that in the channels of the circuit at theta."""
     circuit = None
-    for i, channel in enumerate(likelihood.channels):
+    for i, (channel, source) in enumerate(zip(likelihood.channels, sources, strict=True)):
         if isinstance(channel.observable, ElectricalSignal) and channel.electrical.smooth is not None:
             circuit = circuit or likelihood.evaluate_circuit(theta)
-            gain = np.asarray(circuit.terms[channel.channel].gain_in_step(channel.timing.step), dtype=float)
-            likelihood = likelihood.replace_channel(i, channel.replace_observable(noise_gain=gain))
+            terms = circuit.terms[channel.channel]
+            if channel.channel == "I":
+                channel = colour_noise(channel, terms, source.in_time)
+            else:
+                gain = np.asarray(terms.gain_in_step(channel.timing.step), dtype=float)
+                channel = channel.replace_observable(noise_gain=gain)
+            likelihood = likelihood.replace_channel(i, channel)
     return likelihood
 
 
@@ -272,12 +280,28 @@ def _build_channel(
     if weight is None and len(record) <= MAX_PADDED_LENGTH:
         weight = np.ones(len(record))
     weight = None if weight is None else pad_weight(weight)
+    has_stray = channel == "I" and (scene.stray_capacitance() > 0.0 or STRAY in bare.prior.names)
+    can_smooth = _can_smooth(choice, template)
+    # a current that a resistance limits for most of a step and longer responds like Vsc
+    is_limited = limits_current(template) and taus[-1] >= SHORT_TAU * record.time_step and not has_stray
+    is_limited = is_limited and channel == "I" and can_smooth
+    has_rows = channel == "I" and choice.name == "measured" and not is_limited
     colour, noise = _noise(record, channel, scene)
+    model = scene.measurement.noise_model
+    if channel == "I" and choice.name == "measured":
+        colour, noise, model = None, RecordedCurrent.from_record(record).noise_I, "white"
+        if scene.measurement.noise_model != "white":
+            warnings = (
+                *warnings,
+                "noise_model is that of Vsc; the noise of I with a recorded V is white, and that of V",
+            )
     # edges of a shifted drive are known only to within a step, which affects g; samples of I there are excluded
     skew_sd = _skew_sd(record, scene, choice, template) if channel == "Vsc" else 0.0
-    free = ("delay",) if channel == "Vsc" and (choice.shift != 0.0 or skew_sd > 0.0) else ()
-    has_stray = channel == "I" and (scene.stray_capacitance() > 0.0 or STRAY in bare.prior.names)
-    smooth = _smooth_drive(record) if channel == "Vsc" and _can_smooth(choice, template) else None
+    if is_limited or has_rows:  # converters take channels in turn, and probes delay them
+        skew_sd = max(1.0, scene.skew_limit("I", record.time_step) / record.time_step)
+    is_shifted = choice.shift != 0.0 or skew_sd > 0.0
+    free = ("delay",) if (channel == "Vsc" or is_limited) and is_shifted else ()
+    smooth = _smooth_drive(record) if can_smooth and (channel == "Vsc" or is_limited) else None
     shift, step = (np.asarray(each, dtype=float) for each in (choice.shift, record.time_step))
     timing = DriveTiming(shift, np.zeros(()), step, _timing_sd(record, choice, channel, skew_sd), free)
     # without the samples of an unknown drive, a charge that decays within half a step is over
@@ -295,7 +319,7 @@ def _build_channel(
         linear_sd=linear_sd,
         noise_floor=noise_floor,
         label=label,
-        noise=scene.measurement.noise_model,
+        noise=model,
         columns=tuple(range(len(LINEAR_NUISANCES))),
         stray=np.asarray(scene.stray_capacitance()) if has_stray else None,
     )
@@ -309,13 +333,10 @@ def _build_channel(
         may_have_clock = choice.periodic and choice.steady_state and choice.name != "measured"
         optional = (*optional, "delay", *["clock"] * may_have_clock)
     start = begun.start
-    if channel == "I" and choice.name == "measured":
-        likelihood, start, noise, hum = _make_charge_rows(likelihood, record, scene, bare, taus)
-        if scene.measurement.noise_model != "white":
-            warnings = (
-                *warnings,
-                "noise_model is that of Vsc; the noise of I with a recorded V is white, and that of V",
-            )
+    if is_limited and taus[-1] <= MAX_STEPS * record.time_step and not passes_direct_current(template):  # only late
+        start, _ = estimate_recorded(RecordedCurrent.from_record(record), 0.0, [], prior_skin_moments(bare))
+    if has_rows:
+        likelihood, start, hum = _make_charge_rows(likelihood, record, scene, bare, taus)
         optional = ("drift", "offset", *(f"hum_{frequency:.0f}Hz" for frequency in hum))
     remarks = (*notes, *at_jumps), (*warnings, *clipped)
     return likelihood, Source(record, scene, choice, noise, optional, start, *remarks), begun.edge_sd
@@ -362,11 +383,11 @@ def _make_charge_rows(
     bare: Likelihood,
     taus: Float[np.ndarray, " time_constants"],
     usual_hum: float = 3e-7,  # A: 230 V through 4 pF
-) -> tuple[ChannelLikelihood, CurrentEstimate | None, float, list[float]]:
+) -> tuple[ChannelLikelihood, CurrentEstimate | None, list[float]]:
     """Return the channel of a current with a recorded drive, and an estimate of its circuit.
 
-    Also the noise of I (A), and the frequencies (Hz) of hum that the record shows if it is there. Hum that a circuit
-    may explain has a prior of ten times the noise, `usual_hum` at most.
+    Also the frequencies (Hz) of hum that the record shows if it is there. Hum that a circuit may explain has a prior of
+    ten times the noise, `usual_hum` at most.
     """
     current, stray = RecordedCurrent.from_record(record), scene.stray_capacitance()
     hum = [frequency for frequency in HUM_FREQUENCIES if hum_likeness(current, frequency) < 0.3]
@@ -380,24 +401,20 @@ def _make_charge_rows(
             linear_sd[2 * i + 2 : 2 * i + 4] = min(10.0 * current.noise_I, usual_hum)
     modelled = Current(estimate.capacitance + stray, estimate.weight, 0.0)
     rows, V = current.make_rows(modelled, respond_to(current, estimate, stray), nuisances)
-    # converters take channels in turn, and probes delay them
-    delay_sd = max(1.0, scene.skew_limit("I", record.time_step) / record.time_step)
-    timing = dataclasses.replace(channel.timing, free=("delay",), sd=np.array([delay_sd, channel.timing.sd[1]]))
+    timing = dataclasses.replace(channel.timing, free=("delay",))
     # a resistance that limits I for a part of a step only makes it later
     lags = int(np.count_nonzero(taus < SHORT_TAU * record.time_step)) if limits_current(bare.template) else 0
-    channel = channel.replace_samples(whitening=None).replace_observable(
+    channel = channel.replace_observable(
         drive=Sampled(channel.samples.time, pad_samples(V)), steady_state=False, timing=timing, lags=lags
     )
     channel = dataclasses.replace(
         channel,
-        noise="white",
         linear_sd=linear_sd,
         # residuals of runs of equal values are no measure of the noise
         noise_floor=np.asarray(current.noise_I * (1.0 if current.is_coarse else 0.5)),
     )
-    is_late = taus[-1] <= MAX_STEPS * record.time_step  # and no more than that
-    usable = (is_late or not limits_current(bare.template)) and not passes_direct_current(bare.template)
-    return set_rows(channel, rows, V, 0.0), estimate if usable else None, current.noise_I, hum
+    usable = (lags > 0 or not limits_current(bare.template)) and not passes_direct_current(bare.template)
+    return set_rows(channel, rows, V, 0.0), estimate if usable else None, hum
 
 
 def _can_smooth(choice: DriveModel, template: Circuit) -> bool:

@@ -231,6 +231,8 @@ def require_table(model: WindowModel, source: str) -> None:
     likelihood = model.fit.likelihood
     circuit = likelihood.evaluate_circuit(model.fit.theta)
     reasons = [reason_against_table(each, circuit, TOLERANCE) for each in likelihood.channels]
+    if any(each.samples.charges is None and each.samples.has_drive_noise for each in likelihood.channels):
+        reasons.append("the noise of V in I has a spectrum of its own")
     if len({each.count_untabulated(circuit.tau) for each in likelihood.channels}) > 1:
         reasons.append("a time constant is far below the time step, and the delay of Vsc is not a free parameter")
     if reason := next(filter(None, reasons), ""):

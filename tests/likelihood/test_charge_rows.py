@@ -10,6 +10,7 @@ from fitact.likelihood.charge_rows import (
     ChargeRows,
     RowCovariance,
     estimate_current_noise,
+    mean_filter,
     step_means,
     whiten_rows,
 )
@@ -71,12 +72,13 @@ def test_the_noise_of_I_is_that_of_the_dense_conditional_mean(delay: float):
     excluded = np.isin(np.arange(size), [*range(2 * LAG), 30])
     covariance = RowCovariance(variance, neighbours, excluded)
     gain, decay = covariance.recursion(sd)
-    rows, used = ChargeRows(*np.zeros((3, size)), gain, decay, covariance.used * 1.0), np.flatnonzero(~excluded)
+    used = np.flatnonzero(~excluded)
     residuals = rng.standard_normal(size)
     means = step_means(np.eye(size), delay).T  # rows by samples
     dense = np.diag(variance) + np.diag(neighbours[1:], 1) + np.diag(neighbours[1:], -1)
     expected = sd**2 * means[used].T @ np.linalg.solve(dense[np.ix_(used, used)], residuals[used])
-    found = estimate_current_noise(rows, whiten_rows(gain, decay, residuals), delay)
+    white = covariance.used * whiten_rows(gain, decay, residuals)
+    found = estimate_current_noise(gain, decay, white, *mean_filter(delay))
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 

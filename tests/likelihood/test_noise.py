@@ -1,5 +1,7 @@
 """Coloured noise, outliers, clipped and rounded samples: known truths, and scipy as the reference."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
@@ -12,6 +14,7 @@ import fitact
 from fitact.data.clipping import clipping_mask, has_flat_levels
 from fitact.likelihood.noise import (
     Autoregression,
+    Whitening,
     draw_noise,
     fit_ar_burg,
     scale_information,
@@ -80,6 +83,26 @@ def test_coloured_noise_is_drawn_with_its_correlations(coefficients: list[float]
     # also by position in the record; standard errors are at most 0.01
     expected = scipy.linalg.toeplitz(law[: 50 * stride : stride] / law[0])
     np.testing.assert_allclose(found, expected, atol=0.05)
+
+
+def test_noise_that_a_pole_and_differences_colour_is_whitened_and_drawn():
+    """Own white noise, and white noise n of V through u[k] = a u[k - 1] + g (n[k] - n[k - 1])."""
+    size, a, g, own = 60, 0.7, 1.5, 0.4
+    differences = g * scipy.linalg.toeplitz([1.0, -1.0, *np.zeros(size - 2)], np.eye(1, size)[0])
+    taps = scipy.linalg.toeplitz([1.0, -a, *np.zeros(size - 2)], np.eye(1, size)[0])
+    dense = (own**2 * taps @ taps.T + differences @ differences.T)[1:, 1:]
+    variance, neighbours = np.diag(dense)[[0]] * np.ones(size), dense[0, 1] * np.ones(size)
+    none = np.zeros(size, bool)
+    whitening = Whitening.from_moving_average(np.array([1.0, -a]), variance, neighbours, none, own)
+    values = np.random.default_rng(0).standard_normal((3, size))
+    expected = own * np.linalg.solve(np.linalg.cholesky(dense), (values @ taps.T)[:, 1:].T).T
+    with jax.enable_x64(True):
+        white = np.asarray(whitening(jnp.asarray(values)))
+    np.testing.assert_allclose(white[:, 1:], expected, rtol=1e-10)
+    drawn = own * draw_noise(np.random.default_rng(1), "white", whitening, (20_000, size))
+    expected = np.linalg.solve(taps, np.linalg.solve(taps, own**2 * taps @ taps.T + differences @ differences.T).T)
+    middle = slice(30, None)  # where the start of u is forgotten
+    np.testing.assert_allclose((drawn.T @ drawn / len(drawn))[middle, middle], expected[middle, middle], atol=0.15)
 
 
 def test_burg_finds_a_known_process():

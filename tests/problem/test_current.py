@@ -176,15 +176,18 @@ def test_a_resistance_that_limits_the_current_for_part_of_a_step(R_H: float):
     assert np.max(found.sd[:3]) < 0.02
 
 
-def test_the_table_of_a_current_that_is_late_by_steps_is_the_sum_over_its_samples():
-    """Check 0.6 steps. With the rate of I from differences of samples, sum and table differed by 20."""
+# errors of 4 to 7 u and a misfit, when all such noise of V was taken to follow its rate
+@pytest.mark.parametrize(("R_H", "rate"), [(20e3, 50e3), (100e3, 50e3), (20e3, 200e3)])
+def test_a_resistance_that_limits_the_current_for_some_steps(R_H: float, rate: float):
+    """Check 0.5 to 2.4 steps; what the data determine, table and sum over the samples agree."""
     drive = {"waveform": "trapezoid", "peak_to_peak": 200.0, "frequency": 80.0, "rise_time": 200e-6, "phase": 0.1}
-    record = simulate_bench(drive, 14, 50e3, {"V": 0.1, "Vsc": 0.05, "I": 20e-9}, R_H := 20e3)
+    record = simulate_bench(drive, 14, rate, {"V": 0.1, "Vsc": 0.05, "I": 20e-9}, R_H)
     given = fitact.Scene.from_dict({**bench_scene(["I"]).model_dump(exclude_unset=True), "grounding": {"R_H": R_H}})
     found = fitact.fit(record, given)
     assert found.full_because == ""
-    assert found.compression_error < 1e-3
+    assert found.result == "successful"
     assert np.max(np.abs(errors(found))) < 4.0
+    assert np.max(found.sd[:3]) < 0.03
 
 
 def test_hum_does_not_stand_in_for_a_tone_of_the_drive():
