@@ -109,7 +109,9 @@ class ChargeRows(eqx.Module):
         self, rows: Float[Array, "*shape samples"], before: Float[Array, "*shape"]
     ) -> Float[Array, "*shape samples"]:
         """Return whitened rows, where the whitened ones `before` the first are given."""
-        return continue_whitening(self.gain, self.decay, rows, before)
+        if rows.ndim > 1:
+            return jax.vmap(self.continue_whitening)(rows, before)
+        return recurrence(self.decay, self.gain * rows, before)
 
     def sample_rate(self) -> Float[Array, " samples"]:
         """Return dV/dt at the samples, over two steps, V/s."""
@@ -118,15 +120,6 @@ class ChargeRows(eqx.Module):
     def restrict(self, samples: slice) -> "ChargeRows":
         """Return some of the rows."""
         return jax.tree.map(lambda leaf: leaf[samples], self)
-
-
-def continue_whitening(
-    gain: Float[Array, " rows"], decay: Float[Array, " rows"], rows: Float[Array, "*n rows"], before: Float[Array, "*n"]
-) -> Float[Array, "*n rows"]:
-    """Return w[k] = gain[k] rows[k] + decay[k] w[k - 1], where w[-1] is `before`."""
-    if rows.ndim > 1:
-        return jax.vmap(lambda row, last: continue_whitening(gain, decay, row, last))(rows, before)
-    return recurrence(decay, gain * rows, before)
 
 
 class RowCovariance:

@@ -1,20 +1,22 @@
 """Noise models other than white Gaussian noise: Student-t noise, and coloured noise with a whitening filter."""
 
 import dataclasses
+import functools
 import math
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from fitact.data.clipping import longest_run
 from fitact.data.record import STATE_RATE, Record, is_uniform
 from fitact.errors import InputError
-from fitact.likelihood.charge_rows import RowCovariance, continue_whitening, whiten_rows
+from fitact.model.response import recurrence
 from fitact.model.response_table import chebyshev, chebyshev_polynomials
 
 NoiseModel: TypeAlias = Literal["white", "student", "ar1", "spectrum"]
@@ -114,26 +116,6 @@ class Whitening(eqx.Module):
     gain: Float[Array, " samples"] | None = None
     decay: Float[Array, " samples"] | None = None
 
-    @classmethod
-    def from_moving_average(
-        cls,
-        taps: Float[np.ndarray, "2"],
-        variance: Float[np.ndarray, " samples"],
-        neighbours: Float[np.ndarray, " samples"],
-        excluded: Bool[np.ndarray, " samples"],
-        unit: float,
-        group: Int[np.ndarray, " samples"] | None = None,
-        common: ArrayLike = 0.0,
-    ) -> "Whitening":
-        """Return the filter of noise that `taps` make a moving average, without the samples that are excluded.
-
-        It has then this variance, and covariances with the value before; it is whitened to the standard deviation
-        `unit`.
-        """
-        lost = excluded | np.append(True, excluded[:-1])
-        covariance = RowCovariance(variance, neighbours, lost, group, common)
-        return cls(taps, covariance.used * 1.0, *covariance.recursion(unit))
-
     def begin(self, excluded: Bool[np.ndarray, " samples"]) -> "Whitening":
         """Return the filter without a recursion for other samples, some of which are excluded."""
         taps = np.asarray(self.taps)
@@ -181,9 +163,8 @@ class Whitening(eqx.Module):
         filtered = sum(parts[1:], parts[0])
         if self.gain is None or self.decay is None:
             return filtered
-        if isinstance(filtered, np.ndarray):
-            return whiten_rows(self.gain, self.decay, filtered)
-        return continue_whitening(self.gain, self.decay, filtered, before)
+        continued = functools.partial(recurrence, self.decay)
+        return (jax.vmap(continued) if filtered.ndim > 1 else continued)(self.gain * filtered, before)
 
 
 def draw_noise(

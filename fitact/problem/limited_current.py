@@ -6,8 +6,6 @@ samples, which a recursion whitens exactly (`fitact.likelihood.noise.Whitening`)
 noise: where V bends, I follows a line between them only to a part of its second difference.
 """
 
-import dataclasses
-
 import numpy as np
 import scipy
 from jaxtyping import Float
@@ -15,7 +13,7 @@ from jaxtyping import Float
 from fitact.compiled import pad_samples, pad_weight
 from fitact.data.record import Record
 from fitact.likelihood.channel import ChannelLikelihood
-from fitact.likelihood.charge_rows import estimate_current_noise
+from fitact.likelihood.charge_rows import RowCovariance, estimate_current_noise
 from fitact.likelihood.noise import Whitening
 from fitact.likelihood.smooth_drive import smooth_drive
 from fitact.model.circuit import HighpassTerms
@@ -49,22 +47,20 @@ def colour_noise(channel: ChannelLikelihood, terms: HighpassTerms, record: Recor
     gain, decay = float(fastest.gain_in_step(step)), float(np.exp(-step / terms.tau[-1]))
     driven = gain**2 * np.roll(current.variance_V + interpolation_error(record) ** 2, steps)
     before = np.roll(driven, 1)
-    whitening = Whitening.from_moving_average(
-        np.array([1.0, -decay]),
+    excluded = channel.samples.weights[:size] == 0.0
+    covariance = RowCovariance(
         own**2 * (1.0 + decay**2) + driven + before,
         -decay * own**2 - before,
-        channel.samples.weights[:size] == 0.0,
-        own,
+        excluded | np.append(True, excluded[:-1]),
         np.roll(rounded.group, 1),
         (1.0 - decay) ** 2 * np.roll(rounded.variance * rounded.alike, 1),
     )
-    padded = dataclasses.replace(
-        whitening, **{name: pad_weight(np.asarray(getattr(whitening, name))) for name in ("mask", "gain", "decay")}
-    )
+    recursion = (covariance.used * 1.0, *covariance.recursion(own))
+    whitening = Whitening(np.array([1.0, -decay]), *map(pad_weight, recursion))
     smooth = np.asarray(channel.electrical.smooth)
     noise = np.roll(scipy.signal.lfilter([1.0, -1.0], [1.0, -decay], current.V - smooth[:size]), steps)
     drive = Sampled(channel.samples.time, smooth + pad_samples(noise))
-    channel = channel.replace_samples(whitening=padded, observed=pad_samples(current.I))
+    channel = channel.replace_samples(whitening=whitening, observed=pad_samples(current.I))
     return channel.replace_observable(drive=drive, noise_gain=np.asarray(gain))
 
 

@@ -12,6 +12,7 @@ import scipy.stats
 
 import fitact
 from fitact.data.clipping import clipping_mask, has_flat_levels
+from fitact.likelihood.charge_rows import RowCovariance
 from fitact.likelihood.noise import (
     Autoregression,
     Whitening,
@@ -92,8 +93,8 @@ def test_noise_that_a_pole_and_differences_colour_is_whitened_and_drawn():
     taps = scipy.linalg.toeplitz([1.0, -a, *np.zeros(size - 2)], np.eye(1, size)[0])
     dense = (own**2 * taps @ taps.T + differences @ differences.T)[1:, 1:]
     variance, neighbours = np.diag(dense)[[0]] * np.ones(size), dense[0, 1] * np.ones(size)
-    none = np.zeros(size, bool)
-    whitening = Whitening.from_moving_average(np.array([1.0, -a]), variance, neighbours, none, own)
+    covariance = RowCovariance(variance, neighbours, np.arange(size) == 0)
+    whitening = Whitening(np.array([1.0, -a]), covariance.used * 1.0, *covariance.recursion(own))
     values = np.random.default_rng(0).standard_normal((3, size))
     expected = own * np.linalg.solve(np.linalg.cholesky(dense), (values @ taps.T)[:, 1:].T).T
     with jax.enable_x64(True):
