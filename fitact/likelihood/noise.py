@@ -132,14 +132,6 @@ class Whitening(eqx.Module):
         """Factor of each sample in its own whitened value."""
         return np.abs(float(self.taps[0])) * np.asarray(1.0 if self.gain is None else self.gain)
 
-    def inverse_power(self, cycles: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Return the power of noise that becomes white with sigma = 1, at frequencies in cycles per sample."""
-        turns = np.exp(-2j * np.pi * np.outer(cycles, np.arange(self.taps.size)))
-        power = np.abs(turns @ np.asarray(self.taps)) ** -2.0
-        if self.gain is None or self.decay is None:
-            return power
-        return power * np.abs((1.0 - float(np.median(self.decay)) * turns[:, 1]) / float(np.median(self.gain))) ** 2
-
     def exclude(self, excluded: Bool[np.ndarray, " samples"]) -> "Whitening":
         """Return the filter without the samples that it computes from an excluded one."""
         mask, taps = np.asarray(self.mask), np.trim_zeros(np.asarray(self.taps), "b")
@@ -176,7 +168,7 @@ def draw_noise(
     if whitening is None:
         return rng.standard_normal(shape)
     around = 4 * shape[-1]  # noise is drawn on a circle that is longer than its correlations
-    power = whitening.inverse_power(np.fft.fftfreq(around * stride))
+    power = np.abs(np.fft.fft(np.asarray(whitening.taps), around * stride)) ** -2.0
     power = power.reshape(stride, around).mean(axis=0)  # subsampling folds the spectrum
     lines = np.fft.fft(rng.standard_normal((*shape[:-1], around))) * np.sqrt(power)
     return np.fft.ifft(lines).real[..., : shape[-1]]

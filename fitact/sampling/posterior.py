@@ -433,10 +433,12 @@ class Posterior(Display):
             sd = channel.relative_noise_sd[::stride]
             chosen = self.points[:, draws], self._deviates[:, draws]
             mean = derived.evaluate_draws(_predict_signal, predicting, model.samples.time.size, *chosen)[..., : sd.size]
-            if model.samples.charges is not None:  # whose signal has the derivative of the noise of V
+            whitening = model.samples.whitening
+            if model.samples.has_drive_noise:  # which is in the signal, and not in the record
+                whitening = None
                 mean = mean - np.median(mean, axis=(0, 1)) + channel.prediction[::stride]
             sigma = np.exp(self.points[:, draws, self.fit.theta.size + i, None])
-            noise = draw_noise(rng, model.noise, model.samples.whitening, mean.shape, stride)
+            noise = draw_noise(rng, model.noise, whitening, mean.shape, stride)
             noisy = mean + sigma * sd * noise
             if isinstance(channel.record, Spectrum):
                 shape = "chain", "draw", *_spectrum_axis(channel)
