@@ -57,6 +57,11 @@ def linear_posterior(laplace: Laplace) -> LinearPosterior | None:
     return LinearPosterior(loop, likelihood, laplace.theta, likelihood.prior_factor, names, gradients)
 
 
+def is_assessed(channel: ChannelLikelihood) -> bool:
+    """Return whether effects on a channel are assessed: not on the friction, or a current with a recorded drive."""
+    return channel.channel != "Ft" and not channel.samples.has_drive_noise
+
+
 def channel_samples(laplace: Laplace, traces: Sequence[ChannelFit]) -> list[ChannelSamples]:
     """Return the residuals of all channels, with what is known of their noise and nuisances."""
     with double_precision():
@@ -64,7 +69,7 @@ def channel_samples(laplace: Laplace, traces: Sequence[ChannelFit]) -> list[Chan
     return [
         _channel_samples(laplace, channel, fitted, taus)
         for channel, fitted in zip(laplace.likelihood.channels, traces, strict=True)
-        if fitted.channel != "Ft" and not channel.samples.has_drive_noise
+        if is_assessed(channel)
     ]
 
 

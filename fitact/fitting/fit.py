@@ -16,7 +16,7 @@ from fitact.errors import InputError
 from fitact.fitting import derived, remarks
 from fitact.fitting.calibrate import CalibratedInstruments, calibrate
 from fitact.fitting.channel_fit import ChannelFit, information_criteria
-from fitact.fitting.effects import assess_fit, is_tolerable
+from fitact.fitting.effects import assess_fit, is_assessed, is_tolerable
 from fitact.fitting.error_sources import (
     gain_shifts,
     list_error_sources,
@@ -162,9 +162,7 @@ def _assemble_fit(
     if result == "misfit" and any(trace.channel != "Ft" for trace in poor):
         effects = assess_fit(laplace, traces, has_structure=True)
         # what a poor fit of the friction, or of a current with a recorded drive, may move is not assessed
-        assessed = {
-            each.label for each in likelihood.channels if not each.samples.has_drive_noise and each.channel != "Ft"
-        }
+        assessed = {each.label for each in likelihood.channels if is_assessed(each)}
         may_move = any(is_undersampled(trace.figures) or trace.label not in assessed for trace in poor)
         if effects is not None and not may_move and is_tolerable(effects, laplace, first.scene.tolerance.force):
             result = "structure"

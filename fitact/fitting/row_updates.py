@@ -30,20 +30,18 @@ def update_rows(likelihood: Likelihood, solution: LeastSquaresResult, sources: S
     for i, (channel, solved) in enumerate(zip(likelihood.channels, solution.likelihood.channels, strict=True)):
         # nuisances that were added stay: without them, the next fit leaves the optimum and returns by hundreds of steps
         channel = dataclasses.replace(channel, linear_sd=solved.linear_sd)
-        if channel.samples.charges is None and channel.samples.has_drive_noise:
-            inputs, record = (
-                solution.likelihood.make_inputs(optimum.circuit, solution.theta, solved),
-                sources[i].in_time,
-            )
-            white = sample_residuals(solved.without_compression(), inputs, np.asarray(solution.sigma[i]))[1]
-            channel = estimate_drive(channel.without_compression(), white, record)
-            channel = colour_noise(channel, optimum.terms[channel.channel], record)
-        if channel.samples.charges is not None:
+        if channel.samples.has_drive_noise:
             inputs = solution.likelihood.make_inputs(optimum.circuit, solution.theta, solved)
-            beta = np.asarray(_fit_nuisances(solved, inputs, np.asarray(solution.sigma[i]))[1])
-            sizes = beta * np.asarray(solved.linear_sd)[list(solved.columns)]
-            channel = dataclasses.replace(channel, linear_sd=_expect_harmonics(solved, sizes))
-            channel = set_rows(channel, *_rows_at(solved, inputs, sizes, sources[i].in_time))
+            sigma, record = np.asarray(solution.sigma[i]), sources[i].in_time
+            if channel.samples.charges is None:
+                white = sample_residuals(solved.without_compression(), inputs, sigma)[1]
+                channel = estimate_drive(channel.without_compression(), white, record)
+                channel = colour_noise(channel, optimum.terms[channel.channel], record)
+            else:
+                beta = np.asarray(_fit_nuisances(solved, inputs, sigma)[1])
+                sizes = beta * np.asarray(solved.linear_sd)[list(solved.columns)]
+                channel = dataclasses.replace(channel, linear_sd=_expect_harmonics(solved, sizes))
+                channel = set_rows(channel, *_rows_at(solved, inputs, sizes, record))
         likelihood = likelihood.replace_channel(i, channel)
     return likelihood
 

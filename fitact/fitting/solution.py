@@ -65,7 +65,7 @@ def solve_problem(
             is_still = (skew <= max_skew and np.max(moved) <= max_change) or (skew <= 0.5 and others <= 0.05)
             is_settled = is_settled and round_number > 0 and is_still
         if is_settled:
-            certified, failed = _certify(solved, reasons, tolerance)
+            certified, failed = _certify(solved, root, reasons, tolerance)
             if not failed:
                 return solved, certified, root
             full, likelihood = full | failed, _decompress(likelihood, failed)
@@ -76,13 +76,15 @@ def solve_problem(
             break
     assert best is not None
     problem, reasons, solved = best
-    certified, failed = _certify(solved, reasons, tolerance)
+    root = solved.covariance_factor()
+    certified, failed = _certify(solved, root, reasons, tolerance)
     while failed:
         theta, full = solved.theta[_find_places(solved, problem.likelihood)], full | failed
         problem = problem._replace(likelihood=_decompress(problem.likelihood, failed))
         solved = _solve(problem, tolerance, full, theta)
-        certified, failed = _certify(solved, certified.reasons, tolerance)
-    return solved, certified, solved.covariance_factor()
+        root = solved.covariance_factor()
+        certified, failed = _certify(solved, root, certified.reasons, tolerance)
+    return solved, certified, root
 
 
 def _solve(
@@ -100,13 +102,15 @@ def _solve(
 
 
 def _certify(
-    solved: LeastSquaresResult, reasons: tuple[str, ...], tolerance: float
+    solved: LeastSquaresResult,
+    root: Float[np.ndarray, "parameters parameters"],
+    reasons: tuple[str, ...],
+    tolerance: float,
 ) -> tuple[certificate.CertifiedLikelihood, dict[int, str]]:
     """Verify the compressions at a solution, and return also which failed, and why.
 
-    `reasons` say why channels are not compressed.
+    `root` is a factor of its covariance. `reasons` say why channels are not compressed.
     """
-    root = solved.covariance_factor()
     certified = certificate.certify(solved.likelihood, reasons, solved.theta, root, solved.sigma, tolerance)
     pairs = enumerate(zip(solved.likelihood.channels, certified.reasons, strict=True))
     return certified, {i: why for i, (channel, why) in pairs if why and channel.compression is not None}

@@ -218,11 +218,10 @@ class ChannelLikelihood(eqx.Module):
         charges, electrical = self.samples.charges, self.electrical
         assert charges is not None
         assert isinstance(electrical.drive, Sampled)
-        total, rate = electrical.response_and_rate(inputs, electrical.drive.time)
-        falling, jump = electrical.falling_response(inputs, electrical.drive.time, total)
+        pair, jump, rate = electrical.response_and_fall(inputs, electrical.drive.time)
         if inputs.effects is not None:
-            total = total + inputs.effects @ self.samples.effects / inputs.gain
-        functions = jnp.concatenate([total[None], falling[None], self.shapes(inputs)[self._column_indices]])
+            pair = pair.at[0].add(inputs.effects @ self.samples.effects / inputs.gain)
+        functions = jnp.concatenate([pair, self.shapes(inputs)[self._column_indices]])
         signal, falling, *shapes = charges.means(jnp.pad(functions, ((0, 0), (charges.reach, 0))))
         later = signal + inputs.delay * (falling - jump * charges.rate)
         if rate is not None:

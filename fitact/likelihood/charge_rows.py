@@ -109,8 +109,6 @@ class ChargeRows(eqx.Module):
         self, rows: Float[Array, "*shape samples"], before: Float[Array, "*shape"]
     ) -> Float[Array, "*shape samples"]:
         """Return whitened rows, where the whitened ones `before` the first are given."""
-        if rows.ndim > 1:
-            return jax.vmap(self.continue_whitening)(rows, before)
         return recurrence(self.decay, self.gain * rows, before)
 
     def sample_rate(self) -> Float[Array, " samples"]:

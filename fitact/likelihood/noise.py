@@ -1,12 +1,10 @@
 """Noise models other than white Gaussian noise: Student-t noise, and coloured noise with a whitening filter."""
 
 import dataclasses
-import functools
 import math
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
@@ -155,8 +153,7 @@ class Whitening(eqx.Module):
         filtered = sum(parts[1:], parts[0])
         if self.gain is None or self.decay is None:
             return filtered
-        continued = functools.partial(recurrence, self.decay)
-        return (jax.vmap(continued) if filtered.ndim > 1 else continued)(self.gain * filtered, before)
+        return recurrence(self.decay, self.gain * filtered, before)
 
 
 def draw_noise(

@@ -176,14 +176,23 @@ class ElectricalSignal(Observable):
             total, rate = response_and_rate(inputs.circuit, self.drive, time, **how)
         return total, rate if inputs.stray is None else (0.0 if rate is None else rate) + inputs.stray
 
-    def falling_response(self, inputs: ChannelInputs, time: Array, total: Array) -> tuple[Array, ArrayLike]:
-        """Return minus the derivative of a response `total` in time, beside the rise of the drive, and its gain."""
+    def response_and_fall(
+        self, inputs: ChannelInputs, time: Array
+    ) -> tuple[Float[Array, "2 times"], ArrayLike, ArrayLike | None]:
+        """Return the response without what follows dV/dt, and minus its derivative in time beside a rise of the drive.
+
+        Also the gain of this rise, and the capacitance that follows dV/dt (F), or None.
+        """
         if isinstance(inputs.circuit, WithSkin):
-            return -jnp.diff(total, prepend=total[:1]) / self.timing.step, 0.0
+            total, rate = self.response_and_rate(inputs, time)
+            return jnp.stack([total, -jnp.diff(total, prepend=total[:1]) / self.timing.step]), 0.0, rate
         terms = self.terms(inputs)
-        falling = terms._replace(weight=tuple(w / tau for w, tau in zip(terms.weight, terms.tau, strict=True)))
-        falling = falling._replace(rate=None, direct=None)
-        return superpose_terms(falling, self.drive, time, steady_state=self.steady_state), terms.jump
+        both = tuple(jnp.stack([w, w / tau])[:, None] for w, tau in zip(terms.weight, terms.tau, strict=True))
+        direct = None if terms.direct is None else jnp.stack([terms.direct, 0.0])[:, None]
+        pair = superpose_terms(
+            HighpassTerms(both, terms.tau, None, direct), self.drive, time, steady_state=self.steady_state
+        )
+        return pair, terms.jump, terms.rate
 
     def terms(self, inputs: ChannelInputs) -> HighpassTerms:
         """Return the terms of the channel over V, with the stray capacitance."""

@@ -242,12 +242,16 @@ def knot_values(pieces: LinearPieces, tau: ArrayLike, first: ArrayLike, part: in
 
 
 @jax.jit
-def recurrence(decay: Float[Array, " n"], gain: Float[Array, " n"], first: Float[Array, ""]) -> Float[Array, " n"]:
-    """Return u[k] = decay[k] u[k - 1] + gain[k], from u[-1] = first.
+def recurrence(
+    decay: Float[Array, " n"], gain: Float[Array, "*shape n"], first: Float[Array, "*shape"]
+) -> Float[Array, "*shape n"]:
+    """Return u[k] = decay[k] u[k - 1] + gain[k], from u[-1] = first; each row of `gain` has the same `decay`.
 
     About sqrt(n) blocks are computed in parallel and then joined one after another. These two short loops over
     short vectors run and compile several times faster than an associative scan.
     """
+    if gain.ndim > 1:
+        return jax.vmap(partial(recurrence, decay))(gain, first)
     width = math.isqrt(max(decay.size - 1, 0)) + 1
     missing = -decay.size % width
     decay = jnp.pad(decay, (0, missing), constant_values=1.0).reshape(-1, width)

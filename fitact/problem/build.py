@@ -282,26 +282,26 @@ def _build_channel(
     weight = None if weight is None else pad_weight(weight)
     has_stray = channel == "I" and (scene.stray_capacitance() > 0.0 or STRAY in bare.prior.names)
     can_smooth = _can_smooth(choice, template)
+    is_recorded = channel == "I" and choice.name == "measured"  # its noise contains that of V
     # a current that a resistance limits for most of a step and longer responds like Vsc
-    is_limited = limits_current(template) and taus[-1] >= SHORT_TAU * record.time_step and not has_stray
-    is_limited = is_limited and channel == "I" and can_smooth
-    has_rows = channel == "I" and choice.name == "measured" and not is_limited
+    is_long = limits_current(template) and taus[-1] >= SHORT_TAU * record.time_step
+    is_limited = is_recorded and can_smooth and is_long and not has_stray
+    has_rows = is_recorded and not is_limited
     colour, noise = _noise(record, channel, scene)
-    model = scene.measurement.noise_model
-    if channel == "I" and choice.name == "measured":
+    model, skew_sd = scene.measurement.noise_model, 0.0
+    if is_recorded:
+        if model != "white":
+            text = "noise_model is that of Vsc; the noise of I with a recorded V is white, and that of V"
+            warnings = (*warnings, text)
         colour, noise, model = None, RecordedCurrent.from_record(record).noise_I, "white"
-        if scene.measurement.noise_model != "white":
-            warnings = (
-                *warnings,
-                "noise_model is that of Vsc; the noise of I with a recorded V is white, and that of V",
-            )
-    # edges of a shifted drive are known only to within a step, which affects g; samples of I there are excluded
-    skew_sd = _skew_sd(record, scene, choice, template) if channel == "Vsc" else 0.0
-    if is_limited or has_rows:  # converters take channels in turn, and probes delay them
+        # converters take channels in turn, and probes delay them
         skew_sd = max(1.0, scene.skew_limit("I", record.time_step) / record.time_step)
-    is_shifted = choice.shift != 0.0 or skew_sd > 0.0
-    free = ("delay",) if (channel == "Vsc" or is_limited) and is_shifted else ()
-    smooth = _smooth_drive(record) if can_smooth and (channel == "Vsc" or is_limited) else None
+    elif channel == "Vsc":
+        skew_sd = _skew_sd(record, scene, choice, template)
+    # edges of a shifted drive are known only to within a step, which affects g; samples of I there are excluded
+    has_delay = channel == "Vsc" or is_limited
+    free = ("delay",) if has_delay and (choice.shift != 0.0 or skew_sd > 0.0) else ()
+    smooth = _smooth_drive(record) if can_smooth and has_delay else None
     shift, step = (np.asarray(each, dtype=float) for each in (choice.shift, record.time_step))
     timing = DriveTiming(shift, np.zeros(()), step, _timing_sd(record, choice, channel, skew_sd), free)
     # without the samples of an unknown drive, a charge that decays within half a step is over
