@@ -15,13 +15,31 @@ from fitact.fitting.least_squares import LeastSquaresResult
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.charge_rows import MAX_STEPS, ChargeRows
 from fitact.likelihood.compression import HUM_FREQUENCIES
-from fitact.likelihood.likelihood import Likelihood
+from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.observable import ChannelInputs
 from fitact.model.drive import Sampled
-from fitact.problem.limited_current import colour_noise, estimate_drive
+from fitact.problem.limited_current import (
+    NoisePath,
+    estimate_drive,
+    replace_drive,
+    set_drive,
+)
 from fitact.problem.recorded_current import Current, RecordedCurrent, set_rows
 from fitact.problem.runs import Rows
 from fitact.problem.source import Source
+
+
+def estimate_drives(
+    likelihood: Likelihood, theta: Float[np.ndarray, " parameters"], sources: Sequence[Source]
+) -> Likelihood:
+    """Return the likelihood with estimates at theta of the drives of currents that a resistance limits."""
+    circuit = likelihood.evaluate_circuit(theta)
+    for i, (channel, source) in enumerate(zip(likelihood.channels, sources, strict=True)):
+        if channel.samples.has_drive_noise and channel.samples.charges is None:
+            inputs = likelihood.make_inputs(circuit.circuit, theta, channel)
+            channel = _update_drive(channel, inputs, np.asarray(source.noise), circuit, source.in_time)
+            likelihood = likelihood.replace_channel(i, channel)
+    return likelihood
 
 
 def update_rows(likelihood: Likelihood, solution: LeastSquaresResult, sources: Sequence[Source]) -> Likelihood:
@@ -34,9 +52,9 @@ def update_rows(likelihood: Likelihood, solution: LeastSquaresResult, sources: S
             inputs = solution.likelihood.make_inputs(optimum.circuit, solution.theta, solved)
             sigma, record = np.asarray(solution.sigma[i]), sources[i].in_time
             if channel.samples.charges is None:
-                white = sample_residuals(solved.without_compression(), inputs, sigma)[1]
-                channel = estimate_drive(channel.without_compression(), white, record)
-                channel = colour_noise(channel, optimum.terms[channel.channel], record)
+                delay = inputs.delay + (solved.timing.shift - channel.timing.shift)
+                inputs = dataclasses.replace(inputs, delay=delay)
+                channel = _update_drive(channel, inputs, sigma, optimum, record)
             else:
                 beta = np.asarray(_fit_nuisances(solved, inputs, sigma)[1])
                 sizes = beta * np.asarray(solved.linear_sd)[list(solved.columns)]
@@ -44,6 +62,27 @@ def update_rows(likelihood: Likelihood, solution: LeastSquaresResult, sources: S
                 channel = set_rows(channel, *_rows_at(solved, inputs, sizes, record))
         likelihood = likelihood.replace_channel(i, channel)
     return likelihood
+
+
+def _update_drive(
+    channel: ChannelLikelihood, inputs: ChannelInputs, sigma: np.ndarray, circuit: CircuitValues, record: Record
+) -> ChannelLikelihood:
+    """Return the channel of a limited current with the drive and the noise that its residuals tell."""
+    full, current, size = channel.without_compression(), RecordedCurrent.from_record(record), len(record)
+    late, stray = dataclasses.replace(inputs, gain=np.ones(())), float(inputs.stray or 0.0)
+    whole = dataclasses.replace(late, delay=np.zeros(()), stray=None)
+
+    def respond(V: Rows, inputs: ChannelInputs) -> Rows:
+        return np.asarray(_respond(replace_drive(full, record, V, np.zeros(size)), inputs))[:size]
+
+    # a delay by whole steps does not smooth the noise of V
+    rise = np.diff(current.V - current.smooth, prepend=0.0) / record.time_step
+    noise = respond(current.V, whole) - respond(current.smooth, whole)
+    noise += stray * np.roll(rise, round(float(channel.timing.shift / channel.timing.step)))
+    path = NoisePath.from_terms(circuit.terms[channel.channel], stray, record.time_step)
+    full = set_drive(full, path, record, current.smooth, noise)
+    V = estimate_drive(full, path, sample_residuals(full, inputs, sigma)[1], record)
+    return replace_drive(full, record, V, noise + respond(current.smooth, late) - respond(V, late))
 
 
 def _expect_harmonics(channel: ChannelLikelihood, fitted: Float[np.ndarray, " columns"]) -> np.ndarray:
@@ -104,4 +143,5 @@ def _modelled_rows(channel: ChannelLikelihood, inputs: ChannelInputs, sizes: Arr
     return -rows, sizes @ shapes
 
 
+_respond = jit(ChannelLikelihood.signal)
 _fit_nuisances = jit(ChannelLikelihood.fit_nuisances)

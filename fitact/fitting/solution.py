@@ -8,7 +8,7 @@ from jaxtyping import Float
 from fitact.fitting.instrument_effects import effects_would_change, fill_effects
 from fitact.fitting.least_squares import LeastSquaresResult, solve
 from fitact.fitting.multistart import choose_start
-from fitact.fitting.row_updates import update_rows
+from fitact.fitting.row_updates import estimate_drives, update_rows
 from fitact.fitting.timing import shift_whole_steps, start_delays
 from fitact.likelihood import certificate
 from fitact.likelihood.likelihood import Likelihood
@@ -37,6 +37,7 @@ def solve_problem(
     """
     noise, theta = [source.noise for source in problem.sources], choose_start(problem, start)
     likelihood, best, steps = problem.likelihood, None, 0
+    likelihood = estimate_drives(likelihood, theta, problem.sources)
     full: dict[int, str] = {}  # channels whose table has failed, and why
     has_rows = any(channel.samples.has_drive_noise for channel in likelihood.channels)
     for round_number in range(max_rounds):

@@ -420,7 +420,8 @@ def _restrict_table(
     group = np.cumsum(np.append(0, high[1:] < low[:-1]))
     low = np.array([low[group == g].min() for g in group])
     high = np.array([high[group == g].max() for g in group])
-    since = float(table_half_width(delay_sd)) * float(channel.timing.step)
+    # dV/dt is a mean over half a time step on both sides
+    since = (float(table_half_width(delay_sd)) + 0.5 * (inputs.stray is not None)) * float(channel.timing.step)
     narrow = table.restrict(
         0.5 * (low + high), 0.5 * (high - low), error / largest, charge=charge, delay=(delay - since, delay + since)
     )

@@ -127,12 +127,22 @@ class Compression(eqx.Module):
         total = self.signal @ (jnp.concatenate(series) if self.center.ndim else sum(series, jnp.zeros(())))
         total = jnp.pad(total, (0, self.observed.size - total.size))
         if len(self.steps):
+            slopes = slopes if terms.rate is None else slopes + terms.rate * self._weigh_slopes(delay)
             total = total + jnp.append(slopes, noise_gain) @ self.steps
         if terms.direct is not None:
             if self.voltage is None:
                 raise TypeError("this compression holds no V, which a leak of the insulator needs")
             total = total + terms.direct * self._shift_voltage(self.voltage, delay)
-        return total if terms.rate is None else total + terms.rate * self.rate
+        return total if terms.rate is None or len(self.steps) else total + terms.rate * self.rate
+
+    def _weigh_slopes(self, delay: ArrayLike) -> Float[Array, " ages"]:
+        """Return what to multiply `steps[:-1]` by for the mean dV/dt over a time step around a sample, with a `delay`.
+
+        At the ends of the steps it is that of half a step before.
+        """
+        since, farthest = delay / self.time_step - self.origin, self.reach - 0.5
+        middles = np.arange(2 * self.reach) - farthest
+        return jnp.maximum(1.0 - jnp.abs(jnp.clip(since, -farthest, farthest) - middles), 0.0)
 
     def _shift(self, delay: ArrayLike, tau: ArrayLike) -> tuple[Array, Float[Array, "*nodes ages"]]:
         """Return factors p, q such that the response delayed by `delay` is p (signal + q @ steps[:-1]).

@@ -210,13 +210,18 @@ class Likelihood(eqx.Module):
 
         gain = xp.exp(log_product(channel.gains)) if channel.gains else 1.0
         sizes = [xp.expm1(xp.asarray(log_product(coordinates), float)) for _, coordinates in channel.effect_sizes]
-        inputs = ChannelInputs(circuit, gain, **timing, effects=xp.stack(sizes) if sizes else None, stray=channel.stray)
-        if channel.stray is not None and STRAY in places:
-            inputs = dataclasses.replace(inputs, stray=xp.exp(theta[places[STRAY]]))
+        effects, stray = xp.stack(sizes) if sizes else None, self.stray_capacitance(theta, channel)
+        inputs = ChannelInputs(circuit, gain, **timing, effects=effects, stray=stray)
         if not isinstance(channel.observable, FrictionObservable):
             return inputs
         drive_gain = xp.exp(log_product(channel.drive_gains))
         return dataclasses.replace(inputs, friction=self.friction_parameters(theta), drive_gain=drive_gain)
+
+    def stray_capacitance(self, theta: Array, channel: ChannelLikelihood) -> ArrayLike | None:
+        """Return the stray capacitance whose current a channel contains at theta (F), or None."""
+        if channel.stray is None or STRAY not in self.prior.names:
+            return channel.stray
+        return array_module(theta).exp(theta[self.prior.names.index(STRAY)])
 
     def friction_parameters(self, theta: Array) -> dict[str, Array]:
         """Return the values of those `FRICTION_PARAMETERS` that are free."""

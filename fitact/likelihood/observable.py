@@ -164,6 +164,9 @@ class ElectricalSignal(Observable):
         smooth = dataclasses.replace(self.drive, samples=self.smooth)
         rest = dataclasses.replace(self.drive, samples=self.drive.samples - self.smooth)
         total, _ = response_and_rate(inputs.circuit, smooth, time, steady_state=self.steady_state, channel=self.channel)
+        if inputs.stray is not None:  # mean over a step, as in a table
+            later, earlier = (smooth.value(time + part * self.timing.step) for part in (0.5, -0.5))
+            total = total + inputs.stray / self.timing.step * (later - earlier)
         return total + self.noise_gain * rest.value(recorded)
 
     def response_and_rate(self, inputs: ChannelInputs, time: Array) -> tuple[Array, ArrayLike | None]:

@@ -20,7 +20,6 @@ from fitact.instrument.classes import typical_gain_u
 from fitact.instrument.effects import INPUT_RANGE
 from fitact.likelihood import certificate
 from fitact.likelihood.channel import ChannelLikelihood
-from fitact.likelihood.charge_rows import MAX_STEPS
 from fitact.likelihood.compression import HUM_FREQUENCIES
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import Autoregression, estimate_quiet_noise, require_uniform
@@ -56,7 +55,7 @@ from fitact.problem.instrument_errors import (
     collect_coordinates,
     largest_gain,
 )
-from fitact.problem.limited_current import colour_noise
+from fitact.problem.limited_current import NoisePath, set_drive
 from fitact.problem.recorded_current import Current, RecordedCurrent, estimate_noise, set_rows
 from fitact.problem.runs import long_run_share
 from fitact.problem.skin_model import apply_skin_model, count_harmonics, exclude_jumps, require_skin_response
@@ -200,7 +199,10 @@ def _set_drive_noise(
             circuit = circuit or likelihood.evaluate_circuit(theta)
             terms = circuit.terms[channel.channel]
             if channel.channel == "I":
-                channel = colour_noise(channel, terms, source.in_time)
+                stray = float(likelihood.stray_capacitance(theta, channel) or 0.0)
+                record = source.in_time
+                path = NoisePath.from_terms(terms, stray, record.time_step)
+                channel = set_drive(channel, path, record, RecordedCurrent.from_record(record).smooth)
             else:
                 gain = np.asarray(terms.gain_in_step(channel.timing.step), dtype=float)
                 channel = channel.replace_observable(noise_gain=gain)
@@ -285,7 +287,7 @@ def _build_channel(
     is_recorded = channel == "I" and choice.name == "measured"  # its noise contains that of V
     # a current that a resistance limits for most of a step and longer responds like Vsc
     is_long = limits_current(template) and taus[-1] >= SHORT_TAU * record.time_step
-    is_limited = is_recorded and can_smooth and is_long and not has_stray
+    is_limited = is_recorded and can_smooth and is_long
     has_rows = is_recorded and not is_limited
     colour, noise = _noise(record, channel, scene)
     model, skew_sd = scene.measurement.noise_model, 0.0
@@ -333,8 +335,11 @@ def _build_channel(
         may_have_clock = choice.periodic and choice.steady_state and choice.name != "measured"
         optional = (*optional, "delay", *["clock"] * may_have_clock)
     start = begun.start
-    if is_limited and taus[-1] <= MAX_STEPS * record.time_step and not passes_direct_current(template):  # only late
-        start, _ = estimate_recorded(RecordedCurrent.from_record(record), 0.0, [], prior_skin_moments(bare))
+    if is_limited and not passes_direct_current(template):
+        belief = prior_skin_moments(bare)
+        resistance = 1.0 / float(bare.evaluate_circuit(bare.prior.log_mean).terms["I"].jump)
+        current, stray = RecordedCurrent.from_record(record), scene.stray_capacitance()
+        start, _ = estimate_recorded(current, stray, [], belief, resistance)
     if has_rows:
         likelihood, start, hum = _make_charge_rows(likelihood, record, scene, bare, taus)
         optional = ("drift", "offset", *(f"hum_{frequency:.0f}Hz" for frequency in hum))

@@ -74,18 +74,18 @@ def _scan(
 
 
 def estimate_recorded(
-    current: RecordedCurrent, stray: float, hum: Sequence[float], belief: Belief, most: int = 4096
+    current: RecordedCurrent, stray: float, hum: Sequence[float], belief: Belief, resistance: float = 0.0
 ) -> tuple[CurrentEstimate, Rows]:
     """Estimate the coefficients of I for a recorded V by a scan of b, and return the rows of nuisances.
 
-    Given b, I is linear in the other coefficients, so that the scan finds the global optimum. Charges of several steps
-    add up, so that at most `most` rows serve. `hum` has frequencies (Hz) at which I may have a part of its own.
+    Given b, I is linear in the other coefficients, so that the scan finds the global optimum. A `resistance` (ohm) in
+    the loop makes I late. `hum` has frequencies (Hz) at which I may have a part of its own.
     """
     charge, V = scipy.signal.detrend(np.cumsum(current.I) * current.step), scipy.signal.detrend(current.V)
     C = abs(float(charge @ V)) / float(V @ V)  # between those of low and of high frequencies
     for _ in range(3):
         before = C
-        estimate, nuisances = _scan_recorded(current, C, stray, hum, belief, most)
+        estimate, nuisances = _scan_recorded(current, C, stray, hum, belief, resistance * C)
         C = abs(estimate.capacitance + stray)
         if abs(C - before) < 0.1 * before:
             break
@@ -101,9 +101,19 @@ def _lacks_capacitance(estimate: CurrentEstimate, belief: Belief, least: float =
 
 
 def _scan_recorded(
-    current: RecordedCurrent, C: float, stray: float, hum: Sequence[float], belief: Belief, most: int
+    current: RecordedCurrent,
+    C: float,
+    stray: float,
+    hum: Sequence[float],
+    belief: Belief,
+    lag: float,
+    most: int = 4096,
 ) -> tuple[CurrentEstimate, Rows]:
-    """Return the estimate and the nuisances where noise of V acts through the capacitance `C` (F)."""
+    """Return the estimate and the nuisances where noise of V acts through the capacitance `C` (F).
+
+    I is late by the time constant `lag` (s), and its changes are then uncertain by a time step. Charges of several
+    steps add up, so that at most `most` rows serve.
+    """
     rise = current.rise(current.V)
     several = math.ceil((current.I.size - 3 * LAG) / most)
     first, count = 2 * LAG, (current.I.size - 2 * LAG) // several
@@ -113,12 +123,15 @@ def _scan_recorded(
     common = np.roll(rounded.variance * rounded.alike * run_lengths(rounded.group), LAG)
     own = current.noise_I**2 / several + thin_rows(uncertain * current.jumps.alike + common, several) / several
     own += 1e-24 * float(np.ptp(current.I)) ** 2
-    noise_V = float(np.mean(current.variance_V))
+    decay = math.exp(-current.step / lag) if lag > 0.0 else 0.0
+    noise_V = float(np.mean(current.variance_V)) * (1.0 - decay) / (1.0 + decay)
 
-    V = current.V[first - LAG :: several][: count + 1]
+    V, _ = scipy.signal.lfilter([1.0 - decay], [1.0, -decay], current.V, zi=decay * current.V[:1])
+    V = V[first - LAG :: several][: count + 1]
     V = np.pad(V, (0, count + 1 - V.size), mode="edge")
     time = step * np.arange(count)
     observed = thin_rows(means - stray * rise, several)
+    own += (lag > 0.0) * np.square(np.gradient(observed) / several)
     fixed = np.stack([np.diff(V) / step, np.ones(count), *_waves(hum, time), observed])
 
     @functools.lru_cache
@@ -149,7 +162,8 @@ def _scan_recorded(
         square, amplitudes = fit(tau)
         return square, float(amplitudes[0]), float(amplitudes[2])
 
-    taus = np.geomspace(max(2.0 * step, 1e-4), max(10.0 * step * count, 4e-4), 48)
+    shortest = max(2.0 * step, 3.0 * lag, 1e-4)
+    taus = np.geomspace(shortest, max(10.0 * step * count, 4.0 * shortest), 48)
     estimate = _scan(fit_at_tau, taus, 1.0, belief)
     amplitudes = fit(estimate.b)[1]
     time = current.step * (np.arange(current.I.size) - first)

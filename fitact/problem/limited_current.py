@@ -1,10 +1,16 @@
 """A current that a resistance limits, with a recorded V: it responds to a delayed drive like Vsc, with coloured noise.
 
 Through the fastest time constant tau, noise of V enters I like u[k] = a u[k - 1] + g (n[k] - n[k - 1]), where
-a = e^{-h/tau} for the time step h. In I[k] - a I[k - 1], noise of V and of I is therefore a moving average of two
-samples, which a recursion whitens exactly (`fitact.likelihood.noise.Whitening`). V between two samples is another such
-noise: where V bends, I follows a line between them only to a part of its second difference.
+a = e^{-h/tau} for the time step h, and through a stray capacitance C besides like C / h (n[k] - n[k - 1]). In
+I[k] - a I[k - 1], noise of V and of I is therefore a moving average of two samples, or of three with a stray
+capacitance. One of the two factors of the latter is divided off by the filter, and the other one is whitened by a
+recursion (`fitact.likelihood.noise.Whitening`).
+V between two samples is another such noise: where V bends, I follows a line between them only to a part of its second
+difference. The lines are those that have the mean of V over each step.
 """
+
+import math
+from typing import NamedTuple, Self
 
 import numpy as np
 import scipy
@@ -15,59 +21,121 @@ from fitact.data.record import Record
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.charge_rows import RowCovariance, estimate_current_noise
 from fitact.likelihood.noise import Whitening
-from fitact.likelihood.smooth_drive import smooth_drive
 from fitact.model.circuit import HighpassTerms
 from fitact.model.drive import Sampled
 from fitact.problem.recorded_current import RecordedCurrent
 from fitact.problem.runs import Rows
 
 
+class NoisePath(NamedTuple):
+    """How noise of V enters a current: the filter (`numerator` in powers of the delay by a sample) / (1 - decay z).
+
+    Slower time constants than the fastest one count as infinite.
+    """
+
+    numerator: Float[np.ndarray, "3"]  # S
+    decay: float  # of the fastest time constant in a time step
+    direct: float  # part of the first sample of the numerator that a stray capacitance has
+
+    @classmethod
+    def from_terms(cls, terms: HighpassTerms, stray: float, step: float) -> Self:
+        """Return the path through the fastest of `terms` and a `stray` capacitance (F), for time steps (s)."""
+        slow, limited = (
+            float(HighpassTerms(terms.weight[part], terms.tau[part]).gain_in_step(step))
+            for part in (slice(-1), slice(-1, None))
+        )
+        decay, direct = float(np.exp(-step / terms.tau[-1])), stray / step
+        numerator = np.convolve([1.0, -1.0], [limited + direct, -decay * direct])
+        numerator += np.array([slow, -decay * slow, 0.0])
+        return cls(numerator, decay, direct / (limited + direct))
+
+    @property
+    def gain(self) -> float:
+        """Gain of the first sample, S."""
+        return float(self.numerator[0])
+
+    def respond(self, noise: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+        """Return what the path makes of noise, A."""
+        return scipy.signal.lfilter(self.numerator, [1.0, -self.decay], noise)
+
+    def whitening_taps(
+        self, noise: float, own: float, precision: float = 1e-3, longest: int = 64
+    ) -> Float[np.ndarray, " taps"]:
+        """Return a filter after which the sum of this `noise` of V and of `own` noise of I correlates neighbours only.
+
+        A stray capacitance makes it longer; it ends where it has fallen to `precision`.
+        """
+        from_I = np.array([1.0, -self.decay, 0.0])
+        spectrum = own**2 * np.correlate(from_I, from_I, "full")
+        spectrum += noise**2 * np.correlate(self.numerator, self.numerator, "full")
+        root = float(min(np.roots(spectrum), key=abs).real)
+        needed = 2.0 + (math.log(precision) / math.log(root) if root > precision else 0.0)
+        impulse = np.zeros(min(2 ** math.ceil(math.log2(needed)), longest))
+        impulse[0] = 1.0
+        return scipy.signal.lfilter([1.0, -self.decay], [1.0, -root], impulse)
+
+
 def estimate_drive(
-    channel: ChannelLikelihood, white: Float[np.ndarray, " samples"], record: Record
-) -> ChannelLikelihood:
-    """Return the channel with the drive that is most probable for its `white` residuals.
+    channel: ChannelLikelihood, path: NoisePath, white: Float[np.ndarray, " samples"], record: Record
+) -> Rows:
+    """Return the drive that is most probable for the `white` residuals of a channel, V.
 
     What remains of the noise of V there is independent of the residuals, which otherwise would bias the estimates.
     """
     current, whitening = RecordedCurrent.from_record(record), channel.samples.whitening
     assert whitening is not None
-    gains, decays, gain = np.asarray(whitening.gain), np.asarray(whitening.decay), channel.electrical.noise_gain
-    rise = estimate_current_noise(gains, decays, white, np.array([1.0, -1.0]))[: len(record)]
-    rise = np.roll(rise, -round(float(channel.timing.shift / channel.timing.step)))
-    smooth = current.V + np.asarray(gain) * current.variance_V / current.noise_I**2 * rise
-    return channel.replace_observable(smooth=pad_samples(smooth))
+    gain, decay, taps = (np.asarray(each) for each in (whitening.gain, whitening.decay, whitening.taps))
+    noise_I = estimate_current_noise(gain, decay, white, taps)[: len(record)]
+    noise_V = np.roll(path.respond(noise_I[::-1])[::-1], -round(float(channel.timing.shift / channel.timing.step)))
+    return current.V + current.variance_V / current.noise_I**2 * noise_V
 
 
-def colour_noise(channel: ChannelLikelihood, terms: HighpassTerms, record: Record) -> ChannelLikelihood:
-    """Return the channel of a current with the noise of a record's V and I as a circuit with these `terms` has it."""
-    assert channel.electrical.smooth is not None
-    current, size, step = RecordedCurrent.from_record(record), len(record), record.time_step
-    steps, own, rounded = round(float(channel.timing.shift) / step), current.noise_I, current.rounded
-    fastest = HighpassTerms(terms.weight[-1:], terms.tau[-1:])
-    gain, decay = float(fastest.gain_in_step(step)), float(np.exp(-step / terms.tau[-1]))
-    driven = gain**2 * np.roll(current.variance_V + interpolation_error(record) ** 2, steps)
-    before = np.roll(driven, 1)
+def set_drive(
+    channel: ChannelLikelihood, path: NoisePath, record: Record, V: Rows, noise: Rows | None = None
+) -> ChannelLikelihood:
+    """Return the channel of a current with an estimate of the drive (V).
+
+    The noise is that of the record's V, which comes by this `path`, and of its I. `noise` (A) is the response to what
+    V lacks of the record's, by default that of the path.
+    """
+    current, size = RecordedCurrent.from_record(record), len(record)
+    steps, own, rounded = round(float(channel.timing.shift) / record.time_step), current.noise_I, current.rounded
+    least = float(np.min(current.variance_V))
+    taps = path.whitening_taps(math.sqrt(least), own)
+    from_V = path.respond(taps)
+    # noise beyond the least is uncertain itself: of it, the filter is taken to leave the differences of samples
+    others = current.variance_V - least + interpolation_error(current.smooth, path.direct) ** 2
+    others = path.gain**2 * np.roll(others, steps)
+    before = np.roll(others, 1)
     excluded = channel.samples.weights[:size] == 0.0
     covariance = RowCovariance(
-        own**2 * (1.0 + decay**2) + driven + before,
-        -decay * own**2 - before,
-        excluded | np.append(True, excluded[:-1]),
+        own**2 * (taps @ taps) + least * (from_V @ from_V) + others + before,
+        own**2 * (taps[1:] @ taps[:-1]) + least * (from_V[1:] @ from_V[:-1]) - before,
+        np.convolve(np.append(True, excluded[1:]), np.ones(taps.size))[:size] > 0.5,
         np.roll(rounded.group, 1),
-        (1.0 - decay) ** 2 * np.roll(rounded.variance * rounded.alike, 1),
+        np.sum(taps) ** 2 * np.roll(rounded.variance * rounded.alike, 1),
     )
-    recursion = (covariance.used * 1.0, *covariance.recursion(own))
-    whitening = Whitening(np.array([1.0, -decay]), *map(pad_weight, recursion))
-    smooth = np.asarray(channel.electrical.smooth)
-    noise = np.roll(scipy.signal.lfilter([1.0, -1.0], [1.0, -decay], current.V - smooth[:size]), steps)
-    drive = Sampled(channel.samples.time, smooth + pad_samples(noise))
+    whitening = Whitening(taps, *map(pad_weight, (covariance.used * 1.0, *covariance.recursion(own))))
+    noise = np.roll(path.respond(current.V - V), steps) if noise is None else noise
     channel = channel.replace_samples(whitening=whitening, observed=pad_samples(current.I))
-    return channel.replace_observable(drive=drive, noise_gain=np.asarray(gain))
+    return replace_drive(channel, record, V, noise)
 
 
-def interpolation_error(record: Record, part: float = 0.1) -> Rows:
-    """Return the error of a line between samples of V, V: a `part` of the largest second difference around each.
+def replace_drive(channel: ChannelLikelihood, record: Record, V: Rows, noise: Rows) -> ChannelLikelihood:
+    """Return the channel with the response to V, and besides a fixed response `noise` (A)."""
+    lines = V - second_differences(RecordedCurrent.from_record(record).smooth) / 12.0
+    drive = Sampled(channel.samples.time, pad_samples(lines + noise))
+    return channel.replace_observable(drive=drive, smooth=pad_samples(lines), noise_gain=np.ones(()))
 
-    The line through the ends of a parabola is off by 1/8 of it in the middle, and by 1/12 in the mean.
+
+def second_differences(V: Rows) -> Rows:
+    return np.diff(V, 2, prepend=V[:1], append=V[-1:])
+
+
+def interpolation_error(V: Rows, direct: float = 0.0) -> Rows:
+    """Return the error of a line between samples of V, V: a part of the largest second difference around each.
+
+    The line through the ends of a parabola is off by 1/8 of it in the middle, and by 1/12 in the mean; its slope, to
+    which the part `direct` of I responds, is off by up to 1/2 of it per step at a corner, and by 1/3 in the mean.
     """
-    V = smooth_drive(record["V"], record.noise("V"))
-    return part * scipy.ndimage.maximum_filter1d(np.abs(np.diff(V, 2, prepend=V[:1], append=V[-1:])), 3)
+    return math.hypot(0.1, direct / 3.0) * scipy.ndimage.maximum_filter1d(np.abs(second_differences(V)), 3)

@@ -6,6 +6,7 @@ estimates without bias, unlike the recorded V (`fitact.likelihood.charge_rows`).
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Self
@@ -23,6 +24,7 @@ from fitact.errors import InputError
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.charge_rows import LAG, ROW_NOISE, ChargeRows, RowCovariance, step_means, whiten_rows
 from fitact.likelihood.observable import ChannelInputs
+from fitact.likelihood.smooth_drive import smooth_drive
 from fitact.model.circuit import gain_at
 from fitact.model.drive import Sampled
 from fitact.problem.jumps import Jumps
@@ -35,7 +37,6 @@ class Current(NamedTuple):
     capacitance: float  # that follows dV/dt, with the stray one, F
     conductance: float  # of what does not follow it, S
     delay: float  # against V, in time steps
-    follows: bool = True  # whether it follows dV/dt, which no resistance limits
 
     @classmethod
     def from_channel(cls, channel: ChannelLikelihood, inputs: ChannelInputs, delay: float | None = None) -> Self:
@@ -52,7 +53,7 @@ class Current(NamedTuple):
         omega = math.pi / step * (np.arange(64) + 0.5) / 64.0
         gain = np.asarray(gain_at(terms, omega)) + 1j * omega * stray
         mean_square = float(np.mean(np.abs(gain * np.sinc(0.5 * omega * step / math.pi)) ** 2))
-        return cls(math.sqrt(0.5 * mean_square) * step, 0.0, delay, follows=False)
+        return cls(math.sqrt(0.5 * mean_square) * step, 0.0, delay)
 
     def sample_gains(self, step: float) -> tuple[float, float]:
         """Return the gains (S) of the noise of V, at the first and last sample of a step (s), in the mean current."""
@@ -127,6 +128,11 @@ class RecordedCurrent:
         """Return other samples of V and I, with the same noise."""
         noise = self.noise_V, self.noise_I, least_step(current)
         return self.from_samples(V, current, self.step, *noise, is_whole=False)
+
+    @functools.cached_property
+    def smooth(self) -> Rows:
+        """V without its noise, before any fit."""
+        return smooth_drive(self.V, math.hypot(*self.noise_V))
 
     @property
     def is_coarse(self) -> bool:
@@ -237,21 +243,20 @@ class RecordedCurrent:
         `blocks` of steps, of which those that hold a jump hardly count.
         """
         rise, several = self.rise(self.V), max(1, (self.V.size - 2 * LAG) // blocks)
-        (means, uncertain), follows = self.step_means(modelled), modelled.follows
+        means, uncertain = self.step_means(modelled)
         variance = self._variance(modelled, uncertain * self.jumps.alike)[0]
         variance = np.where(self.excluded_rows(modelled.delay), np.inf, variance)
         weight = 1.0 / np.sqrt(thin_rows(variance, several))
         changing = np.linspace(-1.0, 1.0, rise.size) * rise
-        parts = [np.stack([rise, changing])[: 2 * follows], *functions]
-        columns = np.concatenate([thin_rows(part, several) for part in parts]) * weight
+        columns = np.concatenate([thin_rows(part, several) for part in (np.stack([rise, changing]), *functions)])
+        columns *= weight
         noise = 2.0 * float(np.mean(self.variance_V)) * float(np.sum(weight**2)) / (several * self.step) ** 2
-        sizes = solve_linear(columns, thin_rows(means, several) * weight, (0, noise * follows))[1]
-        capacitance, begin = float(sizes[0]) * follows, 2 * follows
-        rest = sizes[1] * changing if follows else np.zeros(rise.size)
+        sizes = solve_linear(columns, thin_rows(means, several) * weight, (0, noise))[1]
+        capacitance, rest, begin = float(sizes[0]), sizes[1] * changing, 2
         for part in functions:
             rest += sizes[begin : (begin := begin + len(part))] @ part
-        noisy = modelled._replace(capacitance=abs(capacitance)) if follows else modelled
-        rows, _ = self.make_rows(noisy, lambda V: capacitance * self.rise(V) + rest)
+        modelled = modelled._replace(capacitance=abs(capacitance))
+        rows, _ = self.make_rows(modelled, lambda V: capacitance * self.rise(V) + rest)
         # what changes within the window is slow, and hidden by the noise of V at high frequencies
         white = whiten_rows(rows.gain, rows.decay, means - capacitance * rise - rest) * rows.used
         power = np.abs(scipy.fft.rfft(white * np.hanning(white.size))) ** 2

@@ -121,17 +121,24 @@ FINGER = {"Rsc": 180e3, "Csc": 18e-9, "Ci": 0.7e-9}
 
 
 def simulate_bench(
-    drive: dict[str, object], bits: int, rate: float, noise: dict[str, float], R_H: float = 0.0
+    drive: dict[str, object],
+    bits: int,
+    rate: float,
+    noise: dict[str, float],
+    R_H: float = 0.0,
+    stray: float = 0.0,
+    late: float = 0.25,
 ) -> fitact.Record:
-    """Simulate 60 ms of V, Vsc and I of the `FINGER`, I a quarter of a step late, as converters write them."""
+    """Simulate 60 ms of V, Vsc and I of the `FINGER`, I some steps `late`, as converters write them."""
+    lead = {"stray_capacitance": stray} if stray else {}
     own = {
         "device": {"Ci": FINGER["Ci"]},
         "skin": {"Rsc": FINGER["Rsc"], "Csc": FINGER["Csc"]},
         "drive": drive,
-        "measurement": {"channels": ["Vsc", "I"], "sampling_rate": rate, "duration": 0.06},
+        "measurement": {"channels": ["Vsc", "I"], "sampling_rate": rate, "duration": 0.06} | lead,
         "grounding": {"R_H": R_H} if R_H else {},
     }
-    parts = {"delay": {"I": 0.25 / rate}, "white": noise, "converter": {"bits": bits, "auto": True}}
+    parts = {"delay": {"I": late / rate}, "white": noise, "converter": {"bits": bits, "auto": True}}
     checked = validate_sections(parts, data_synth.recipe.KEYS, "bench")
     scene = data_synth.scene.make_scene(own, {}, "bench")
     recipe = data_synth.recipe.Recipe("bench", "", scene, checked, tuple(parts), 3, "scipy")
@@ -177,13 +184,25 @@ def test_a_resistance_that_limits_the_current_for_part_of_a_step(R_H: float):
 
 
 # errors of 4 to 7 u and a misfit, when all such noise of V was taken to follow its rate
-@pytest.mark.parametrize(("R_H", "rate"), [(20e3, 50e3), (100e3, 50e3), (20e3, 200e3)])
-def test_a_resistance_that_limits_the_current_for_some_steps(R_H: float, rate: float):
-    """Check 0.5 to 2.4 steps; what the data determine, table and sum over the samples agree."""
+@pytest.mark.parametrize(
+    ("R_H", "rate", "stray", "late"),
+    [
+        (20e3, 50e3, 0.0, 0.25),
+        (100e3, 50e3, 0.0, 1.6),
+        (20e3, 200e3, 0.0, -1.6),
+        (16e3, 50e3, 10e-12, 0.25),
+        (20e3, 200e3, 100e-12, 0.25),
+        (200e3, 200e3, 100e-12, 1.6),
+    ],
+)
+def test_a_resistance_that_limits_the_current_for_some_steps(R_H: float, rate: float, stray: float, late: float):
+    """Check 0.4 to 24 steps; what the data determine, table and sum over the samples agree."""
     drive = {"waveform": "trapezoid", "peak_to_peak": 200.0, "frequency": 80.0, "rise_time": 200e-6, "phase": 0.1}
-    record = simulate_bench(drive, 14, rate, {"V": 0.1, "Vsc": 0.05, "I": 20e-9}, R_H)
-    given = fitact.Scene.from_dict({**bench_scene(["I"]).model_dump(exclude_unset=True), "grounding": {"R_H": R_H}})
-    found = fitact.fit(record, given)
+    record = simulate_bench(drive, 14, rate, {"V": 0.1, "Vsc": 0.05, "I": 20e-9}, R_H, stray, late)
+    given = bench_scene(["I"]).model_dump(exclude_unset=True) | {"grounding": {"R_H": R_H}}
+    if stray:
+        given["measurement"] |= {"current_lead": "drive", "stray_capacitance": stray}
+    found = fitact.fit(record, fitact.Scene.from_dict(given))
     assert found.full_because == ""
     assert found.result == "successful"
     assert np.max(np.abs(errors(found))) < 4.0
