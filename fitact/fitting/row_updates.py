@@ -12,6 +12,7 @@ from fitact.compiled import jit, pad_samples
 from fitact.data.record import Record
 from fitact.fitting.channel_fit import sample_residuals
 from fitact.fitting.least_squares import LeastSquaresResult
+from fitact.fitting.timing import free_timing
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.charge_rows import MAX_STEPS, ChargeRows
 from fitact.likelihood.compression import HUM_FREQUENCIES
@@ -32,11 +33,15 @@ from fitact.problem.source import Source
 def estimate_drives(
     likelihood: Likelihood, theta: Float[np.ndarray, " parameters"], sources: Sequence[Source]
 ) -> Likelihood:
-    """Return the likelihood with estimates at theta of the drives of currents that a resistance limits."""
+    """Return the likelihood with estimates at theta of the delays and drives of currents that a resistance limits.
+
+    An estimate of the drive at a wrong delay would be a minimum.
+    """
     circuit = likelihood.evaluate_circuit(theta)
     for i, (channel, source) in enumerate(zip(likelihood.channels, sources, strict=True)):
         if channel.samples.has_drive_noise and channel.samples.charges is None:
             inputs = likelihood.make_inputs(circuit.circuit, theta, channel)
+            channel = free_timing(channel, inputs, circuit, "delay")
             channel = _update_drive(channel, inputs, np.asarray(source.noise), circuit, source.in_time)
             likelihood = likelihood.replace_channel(i, channel)
     return likelihood
@@ -70,16 +75,18 @@ def _update_drive(
     """Return the channel of a limited current with the drive and the noise that its residuals tell."""
     full, current, size = channel.without_compression(), RecordedCurrent.from_record(record), len(record)
     late, stray = dataclasses.replace(inputs, gain=np.ones(())), float(inputs.stray or 0.0)
-    whole = dataclasses.replace(late, delay=np.zeros(()), stray=None)
+    shift, step = float(channel.timing.shift), record.time_step
+    steps = round(shift / step)
+    whole = dataclasses.replace(late, delay=np.asarray(steps * step - shift), stray=None)
 
     def respond(V: Rows, inputs: ChannelInputs) -> Rows:
         return np.asarray(_respond(replace_drive(full, record, V, np.zeros(size)), inputs))[:size]
 
     # a delay by whole steps does not smooth the noise of V
-    rise = np.diff(current.V - current.smooth, prepend=0.0) / record.time_step
+    rise = np.diff(current.V - current.smooth, prepend=0.0) / step
     noise = respond(current.V, whole) - respond(current.smooth, whole)
-    noise += stray * np.roll(rise, round(float(channel.timing.shift / channel.timing.step)))
-    path = NoisePath.from_terms(circuit.terms[channel.channel], stray, record.time_step)
+    noise += stray * np.roll(rise, steps)
+    path = NoisePath.from_terms(circuit.terms[channel.channel], stray, step)
     full = set_drive(full, path, record, current.smooth, noise)
     V = estimate_drive(full, path, sample_residuals(full, inputs, sigma)[1], record)
     return replace_drive(full, record, V, noise + respond(current.smooth, late) - respond(V, late))

@@ -5,8 +5,9 @@ a = e^{-h/tau} for the time step h, and through a stray capacitance C besides li
 I[k] - a I[k - 1], noise of V and of I is therefore a moving average of two samples, or of three with a stray
 capacitance. One of the two factors of the latter is divided off by the filter, and the other one is whitened by a
 recursion (`fitact.likelihood.noise.Whitening`).
-V between two samples is another such noise: where V bends, I follows a line between them only to a part of its second
-difference. The lines are those that have the mean of V over each step.
+Between samples, V is taken as lines that have the mean of a parabola over each step; at a corner, which the bend of a
+single sample shows, as lines between the samples. What V differs from them is another noise, a part of the second
+difference: its mean over a step acts through tau, and its value at a time between samples like noise of V.
 """
 
 import math
@@ -87,7 +88,8 @@ def estimate_drive(
     gain, decay, taps = (np.asarray(each) for each in (whitening.gain, whitening.decay, whitening.taps))
     noise_I = estimate_current_noise(gain, decay, white, taps)[: len(record)]
     noise_V = np.roll(path.respond(noise_I[::-1])[::-1], -round(float(channel.timing.shift / channel.timing.step)))
-    return current.V + current.variance_V / current.noise_I**2 * noise_V
+    largest = 5.0 * np.sqrt(current.variance_V)  # more is no noise of V, but a misfit
+    return current.V + np.clip(current.variance_V / current.noise_I**2 * noise_V, -largest, largest)
 
 
 def set_drive(
@@ -103,13 +105,18 @@ def set_drive(
     least = float(np.min(current.variance_V))
     taps = path.whitening_taps(math.sqrt(least), own)
     from_V = path.respond(taps)
-    # noise beyond the least is uncertain itself: of it, the filter is taken to leave the differences of samples
-    others = current.variance_V - least + interpolation_error(current.smooth, path.direct) ** 2
-    others = path.gain**2 * np.roll(others, steps)
-    before = np.roll(others, 1)
+    # V differs from the chord by 1/12 of the bend in the mean; at a corner, which has the rest of it, slopes by a third
+    bend = second_differences(current.smooth)
+    bend, corner = (scipy.ndimage.maximum_filter1d(np.abs(each), 3) for each in (bend, bend - usual_bend(bend)))
+    in_mean, between = 0.1 * min(-math.log(max(path.decay, 1e-9)), 3.0), math.hypot(0.1, path.direct / 3.0)
+    alone, varying = (
+        path.gain**2 * np.roll(each, steps)
+        for each in ((in_mean * corner) ** 2, current.variance_V - least + (between * bend) ** 2)
+    )
+    before = np.roll(varying, 1)  # the filter is taken to leave the differences of samples
     excluded = channel.samples.weights[:size] == 0.0
     covariance = RowCovariance(
-        own**2 * (taps @ taps) + least * (from_V @ from_V) + others + before,
+        own**2 * (taps @ taps) + least * (from_V @ from_V) + varying + before + alone,
         own**2 * (taps[1:] @ taps[:-1]) + least * (from_V[1:] @ from_V[:-1]) - before,
         np.convolve(np.append(True, excluded[1:]), np.ones(taps.size))[:size] > 0.5,
         np.roll(rounded.group, 1),
@@ -123,19 +130,15 @@ def set_drive(
 
 def replace_drive(channel: ChannelLikelihood, record: Record, V: Rows, noise: Rows) -> ChannelLikelihood:
     """Return the channel with the response to V, and besides a fixed response `noise` (A)."""
-    lines = V - second_differences(RecordedCurrent.from_record(record).smooth) / 12.0
+    lines = V - usual_bend(second_differences(RecordedCurrent.from_record(record).smooth)) / 12.0
     drive = Sampled(channel.samples.time, pad_samples(lines + noise))
     return channel.replace_observable(drive=drive, smooth=pad_samples(lines), noise_gain=np.ones(()))
 
 
+def usual_bend(bend: Rows) -> Rows:
+    """Return second differences without those of single corners."""
+    return scipy.ndimage.median_filter(bend, 3)
+
+
 def second_differences(V: Rows) -> Rows:
     return np.diff(V, 2, prepend=V[:1], append=V[-1:])
-
-
-def interpolation_error(V: Rows, direct: float = 0.0) -> Rows:
-    """Return the error of a line between samples of V, V: a part of the largest second difference around each.
-
-    The line through the ends of a parabola is off by 1/8 of it in the middle, and by 1/12 in the mean; its slope, to
-    which the part `direct` of I responds, is off by up to 1/2 of it per step at a corner, and by 1/3 in the mean.
-    """
-    return math.hypot(0.1, direct / 3.0) * scipy.ndimage.maximum_filter1d(np.abs(second_differences(V)), 3)

@@ -185,19 +185,21 @@ def test_a_resistance_that_limits_the_current_for_part_of_a_step(R_H: float):
 
 # errors of 4 to 7 u and a misfit, when all such noise of V was taken to follow its rate
 @pytest.mark.parametrize(
-    ("R_H", "rate", "stray", "late"),
+    ("R_H", "rate", "stray", "late", "rise_time"),
     [
-        (20e3, 50e3, 0.0, 0.25),
-        (100e3, 50e3, 0.0, 1.6),
-        (20e3, 200e3, 0.0, -1.6),
-        (16e3, 50e3, 10e-12, 0.25),
-        (20e3, 200e3, 100e-12, 0.25),
-        (200e3, 200e3, 100e-12, 1.6),
+        (20e3, 50e3, 0.0, 0.25, 200e-6),
+        (100e3, 50e3, 0.0, 1.6, 20e-6),
+        (20e3, 200e3, 0.0, -1.6, 200e-6),
+        (16e3, 50e3, 10e-12, 0.25, 200e-6),
+        (20e3, 200e3, 100e-12, 0.25, 200e-6),
+        (200e3, 200e3, 100e-12, 1.6, 200e-6),
     ],
 )
-def test_a_resistance_that_limits_the_current_for_some_steps(R_H: float, rate: float, stray: float, late: float):
-    """Check 0.4 to 24 steps; what the data determine, table and sum over the samples agree."""
-    drive = {"waveform": "trapezoid", "peak_to_peak": 200.0, "frequency": 80.0, "rise_time": 200e-6, "phase": 0.1}
+def test_a_resistance_that_limits_the_current_for_some_steps(
+    R_H: float, rate: float, stray: float, late: float, rise_time: float
+):
+    """Check 0.4 to 24 steps, with sharp corners and edges of one step or more; what the data determine, table and sum over the samples agree."""
+    drive = {"waveform": "trapezoid", "peak_to_peak": 200.0, "frequency": 80.0, "rise_time": rise_time, "phase": 0.1}
     record = simulate_bench(drive, 14, rate, {"V": 0.1, "Vsc": 0.05, "I": 20e-9}, R_H, stray, late)
     given = bench_scene(["I"]).model_dump(exclude_unset=True) | {"grounding": {"R_H": R_H}}
     if stray:
