@@ -198,7 +198,7 @@ def test_a_resistance_that_limits_the_current_for_part_of_a_step(R_H: float):
 def test_a_resistance_that_limits_the_current_for_some_steps(
     R_H: float, rate: float, stray: float, late: float, rise_time: float
 ):
-    """Check 0.4 to 24 steps, with sharp corners and edges of one step or more; what the data determine, table and sum over the samples agree."""
+    """Check 0.4 to 24 steps, corners, and edges of one step or more; table and sum over the samples agree."""
     drive = {"waveform": "trapezoid", "peak_to_peak": 200.0, "frequency": 80.0, "rise_time": rise_time, "phase": 0.1}
     record = simulate_bench(drive, 14, rate, {"V": 0.1, "Vsc": 0.05, "I": 20e-9}, R_H, stray, late)
     given = bench_scene(["I"]).model_dump(exclude_unset=True) | {"grounding": {"R_H": R_H}}
