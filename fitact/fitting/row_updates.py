@@ -19,12 +19,7 @@ from fitact.likelihood.compression import HUM_FREQUENCIES
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.observable import ChannelInputs
 from fitact.model.drive import Sampled
-from fitact.problem.limited_current import (
-    NoisePath,
-    estimate_drive,
-    replace_drive,
-    set_drive,
-)
+from fitact.problem.limited_current import NoisePath, estimate_drive, replace_drive, set_drive
 from fitact.problem.recorded_current import Current, RecordedCurrent, set_rows
 from fitact.problem.runs import Rows
 from fitact.problem.source import Source

@@ -106,8 +106,8 @@ def set_drive(
     taps = path.whitening_taps(math.sqrt(least), own)
     from_V = path.respond(taps)
     # V differs from the chord by 1/12 of the bend in the mean; at a corner, which has the rest of it, slopes by a third
-    bend = second_differences(current.smooth)
-    bend, corner = (scipy.ndimage.maximum_filter1d(np.abs(each), 3) for each in (bend, bend - usual_bend(bend)))
+    sizes = np.abs([current.bend, current.bend - current.lasting_bend])
+    bend, corner = scipy.ndimage.maximum_filter1d(sizes, 3)
     in_mean, between = 0.1 * min(-math.log(max(path.decay, 1e-9)), 3.0), math.hypot(0.1, path.direct / 3.0)
     alone, varying = (
         path.gain**2 * np.roll(each, steps)
@@ -130,15 +130,6 @@ def set_drive(
 
 def replace_drive(channel: ChannelLikelihood, record: Record, V: Rows, noise: Rows) -> ChannelLikelihood:
     """Return the channel with the response to V, and besides a fixed response `noise` (A)."""
-    lines = V - usual_bend(second_differences(RecordedCurrent.from_record(record).smooth)) / 12.0
+    lines = V - RecordedCurrent.from_record(record).lasting_bend / 12.0
     drive = Sampled(channel.samples.time, pad_samples(lines + noise))
     return channel.replace_observable(drive=drive, smooth=pad_samples(lines), noise_gain=np.ones(()))
-
-
-def usual_bend(bend: Rows) -> Rows:
-    """Return second differences without those of single corners."""
-    return scipy.ndimage.median_filter(bend, 3)
-
-
-def second_differences(V: Rows) -> Rows:
-    return np.diff(V, 2, prepend=V[:1], append=V[-1:])

@@ -134,6 +134,16 @@ class RecordedCurrent:
         """V without its noise, before any fit."""
         return smooth_drive(self.V, math.hypot(*self.noise_V))
 
+    @functools.cached_property
+    def bend(self) -> Rows:
+        """Second differences of the smooth V, V."""
+        return np.diff(self.smooth, 2, prepend=self.smooth[:1], append=self.smooth[-1:])
+
+    @functools.cached_property
+    def lasting_bend(self) -> Rows:
+        """Second differences without those of single corners, V."""
+        return scipy.ndimage.median_filter(self.bend, 3)
+
     @property
     def is_coarse(self) -> bool:
         """Whether I has long runs of equal values, whose rounding is no noise."""
