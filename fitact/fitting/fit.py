@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from fitact.blas import limit_to_one_thread
 from fitact.compiled import double_precision
@@ -85,8 +85,13 @@ def fit_records(
     start: Mapping[str, float] | None = None,
     starts: int = 1,
     tolerance: float = certificate.TOLERANCE,
+    excluded: Sequence[Bool[np.ndarray, " samples"]] = (),
 ) -> Fit:
-    """Fit records as `fit` does; `drives` are the drives of the first records if they were chosen already."""
+    """Fit records as `fit` does.
+
+    `drives` are the drives of the first records if they were chosen already; `excluded` are masks of
+    samples (with padding), one for each channel, that do not enter the likelihood.
+    """
     if not 0.0 <= tolerance < math.inf:
         raise InputError(f"tolerance = {tolerance}: give an error of the log-likelihood, 0.001 or so, or 0 for none")
     if starts < 1:
@@ -104,6 +109,8 @@ def fit_records(
     with double_precision(), limit_to_one_thread():
         try:
             problem = build_problem(records, scenes, prior, drives)
+            for i, mask in enumerate(excluded):
+                problem = problem.exclude_samples(i, mask)
             calibrated = calibrate(scenes[0], problem.likelihood.prior.names, fit_records)
             if calibrated.calibration is not None:
                 likelihood = dataclasses.replace(problem.likelihood, calibration=calibrated.calibration)

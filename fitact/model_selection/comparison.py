@@ -11,7 +11,7 @@ from jaxtyping import Float
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
-from fitact.fitting.fit import fit
+from fitact.fitting.fit import fit_records
 from fitact.fitting.result import Fit
 from fitact.model_selection.cross_validation import CrossValidation, cross_validate
 from fitact.scene.scene import Scene
@@ -188,13 +188,25 @@ def compare(
                 f"{first} models {' and '.join(reference)}, {name} models {' and '.join(channels)}: only"
                 " models of the same samples can be compared; give both the same [measurement] channels"
             )
-    fits = {name: fit(records, scene) for name, scene in scenes.items()}
-    _require_same_samples(fits)
+    fits = _fit_same_samples((records,) if isinstance(records, Record | Spectrum) else tuple(records), scenes)
     scores = [ModelScore(name, fitted, cross_validate(fitted)) for name, fitted in fits.items()]
     note, laws = "", {scene.force.model for scene in scenes.values()}
     if len(laws) > 1 and all("force_scale" in fitted.names for fitted in fits.values()):
         note = " As force_scale is free, only the shape of the force in time tells the force laws apart."
     return Comparison(tuple(sorted(scores, key=lambda model: -model.elpd)), note=note)
+
+
+def _fit_same_samples(records: tuple[Record | Spectrum, ...], scenes: Mapping[str, Scene]) -> dict[str, Fit]:
+    """Return the fits of the scenes, repeated with the samples that all of them use if they differ in these."""
+    fits = {name: fit_records(records, (scene,) * len(records)) for name, scene in scenes.items()}
+    used = {name: [each.samples.likelihood_mask for each in fit.likelihood.channels] for name, fit in fits.items()}
+    shared = [np.logical_and.reduce(masks) for masks in zip(*used.values(), strict=True)]
+    for name, masks in used.items():
+        excluded = [mask & ~common for mask, common in zip(masks, shared, strict=True)]
+        if any(map(np.any, excluded)):
+            fits[name] = fit_records(records, (scenes[name],) * len(records), excluded=excluded)
+    _require_same_samples(fits)
+    return fits
 
 
 def _require_same_samples(fits: Mapping[str, Fit]) -> None:

@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -96,6 +96,11 @@ class Problem(NamedTuple):
                 found.append(certificate.compress_channel(channel, at_start, tolerance))
         channels, reasons = zip(*found, strict=True)
         return dataclasses.replace(self.likelihood, channels=channels), reasons
+
+    def exclude_samples(self, channel: int, excluded: Bool[np.ndarray, " samples"]) -> Self:
+        """Return the problem in which samples of a channel do not enter the likelihood."""
+        remaining = self.likelihood.channels[channel].exclude_samples(excluded)
+        return self._replace(likelihood=self.likelihood.replace_channel(channel, remaining))
 
     def experiment(
         self, likelihood: Likelihood, circuit: Circuit, theta: np.ndarray, sigma: np.ndarray
