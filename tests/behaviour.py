@@ -247,7 +247,10 @@ def _is_close(path: str, a: Any, b: Any, old: dict[str, Any], estimates: bool) -
         return True
     if path.endswith(".steps"):
         return max(a, b) <= 3 * min(a, b)  # where steps end in rounding, versions of XLA differ
-    sd = old.get(re.sub(r"\.\w+$", ".sd", path))
+    if re.search(r"\bcorrelation\b", path):
+        return abs(a - b) <= 1e-6
+    # a standard uncertainty u, relative to its estimate, follows the estimate
+    sd = a * a if path.endswith(".u") else old.get(re.sub(r"\.\w+$", ".sd", path))
     return abs(a - b) <= max(1e-4 * abs(sd) if isinstance(sd, float) else 0.0, 1e-6 * max(abs(a), abs(b)))
 
 

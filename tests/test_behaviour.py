@@ -37,6 +37,10 @@ def test_users_get_what_was_recorded(results):
     [
         ({"a": {"mean": 1.0, "sd": 0.1}}, {"a": {"mean": 1.0 + 9e-6, "sd": 0.1}}, 0),
         ({"a": {"mean": 1.0, "sd": 0.1}}, {"a": {"mean": 1.0 + 2e-5, "sd": 0.1}}, 1),
+        ({"a": {"u": 0.06}}, {"a": {"u": 0.06 + 3e-7}}, 0),
+        ({"a": {"u": 0.06}}, {"a": {"u": 0.06 + 5e-7}}, 1),
+        ({"correlation": {"matrix": [-6.9e-9]}}, {"correlation": {"matrix": [-6.8e-9]}}, 0),
+        ({"correlation": {"matrix": [0.5]}}, {"correlation": {"matrix": [0.500002]}}, 1),
         ({"said": ["± 5.1 % of 3"]}, {"said": ["± 5.2 % of 3"]}, 1),
         ({"said": ["no column"]}, {"said": ["no row"]}, 1),
         ({"a": 1, "b": 2}, {"a": 1}, 1),
