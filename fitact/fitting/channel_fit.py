@@ -218,10 +218,13 @@ def _student_log_likelihood(residuals: Samples, weight: Samples, scale: float) -
 @jit
 def sample_residuals(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: Array) -> tuple[Array, Array, Array]:
     """Return the residuals, the whitened residuals, and the linear nuisances in units of their prior sd."""
-    white, beta, _ = channel.fit_nuisances(inputs, sigma)
-    columns = np.array(channel.columns, dtype=int)
-    residuals = channel.samples.observed - channel.signal(inputs)
-    residuals = residuals - beta @ (channel.linear_sd[columns, None] * channel.shapes(inputs)[columns])
+    remainder, shapes = channel.remainder_and_shapes(inputs)
+    if channel.samples.charges is None:
+        whiten = channel.samples.apply_whitening
+        white, beta, _ = channel.fit_rows(whiten(remainder), whiten(shapes), sigma)
+    else:
+        white, beta, _ = channel.fit_nuisances(inputs, sigma)
+    residuals = remainder - beta @ (channel.linear_sd[np.array(channel.columns, dtype=int), None] * shapes)
     if channel.noise == "student":
         white = white * jnp.sqrt(student_weight(white / sigma))
     return residuals, white, beta

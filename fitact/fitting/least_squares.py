@@ -102,9 +102,9 @@ def _solve_round(likelihood: Likelihood, start: Array, sigma: Array, damping: Ar
     theta, fraction = minimum.theta, minimum.theta.size / likelihood.count  # parameters per sample
     parts = []
     for (channel, inputs), s in zip(likelihood.channels_and_inputs(theta), sigma, strict=True):
-        residuals = channel.fit_nuisances(inputs, s)[0]
-        factor = jnp.sqrt(student_weight(residuals / s)) if channel.is_student else 1.0
         remainder, shapes = channel.residuals_and_shapes(inputs)
+        residuals = channel.fit_rows(remainder, shapes, s)[0]
+        factor = jnp.sqrt(student_weight(residuals / s)) if channel.is_student else 1.0
         signal, slope = channel.whitened_observed() - remainder, channel.whitened_delay_derivative(inputs)
         sigma_new = _noise(channel, residuals, fraction) if channel.expansion is None else channel.expansion.sigma
         parts.append((residuals, sigma_new, *(factor * x for x in (residuals, shapes, slope, signal))))

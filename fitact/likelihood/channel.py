@@ -32,7 +32,7 @@ from fitact.likelihood.observable import LINEAR_NUISANCES, SHORT_TAU, ChannelInp
 from fitact.likelihood.padded_samples import PaddedSamples
 from fitact.likelihood.projection import MAX_DELAY, baseline_functions
 from fitact.likelihood.spectrum_observable import SpectrumObservable
-from fitact.model.circuit import Channel
+from fitact.model.circuit import Channel, HighpassTerms
 from fitact.model.drive import Sampled
 
 
@@ -194,22 +194,33 @@ class ChannelLikelihood(eqx.Module):
 
     def residuals_and_shapes(self, inputs: ChannelInputs) -> tuple[Float[Array, " rows"], Float[Array, "columns rows"]]:
         """Return channel minus signal, and the shapes of the `columns`, both whitened, over samples or coordinates."""
-        samples = self.samples
-        if self.compression is None and samples.charges is not None:
-            remainder, shapes = self.rows_and_shapes(inputs)
-            return samples.charges.whiten(remainder), samples.charges.whiten(shapes)
-        if self.compression is None:
-            remainder, shapes = samples.observed - self.signal(inputs), self.shapes(inputs)[self._column_indices]
-            return samples.apply_whitening(remainder), samples.apply_whitening(shapes)
-        remainder = self.compression.observed - self._compressed_signal(inputs)[0]
-        shapes = [self.compression.baseline]
-        if isinstance(self.compression, Compression) and not isinstance(self.compression, GridCompression):
-            terms = self.electrical.terms(inputs)
-            taus = terms.without_fastest(self.compression.short).tau  # those decay before the first sample that counts
-            shapes += [self.compression.decays(tau, index)[None] for index, tau in enumerate(taus)]
+        return self._evaluate_rows(inputs)[:2]
+
+    def _evaluate_rows(
+        self, inputs: ChannelInputs
+    ) -> tuple[Float[Array, " rows"], Float[Array, "columns rows"], ArrayLike]:
+        """Return `residuals_and_shapes`, and whether the compression holds."""
+        samples, table = self.samples, self.compression
+        if table is None:
+            whiten = samples.apply_whitening if samples.charges is None else samples.charges.whiten
+            rows = self.remainder_and_shapes if samples.charges is None else self.rows_and_shapes
+            remainder, shapes = rows(inputs)
+            return whiten(remainder), whiten(shapes), True
+        terms = None if isinstance(table, Interpolation) else self.electrical.terms(inputs)
+        signal, holds = self._compressed_signal(inputs, terms)
+        shapes = [table.baseline]
+        if terms is not None and isinstance(table, Compression) and not isinstance(table, GridCompression):
+            taus = terms.without_fastest(table.short).tau  # those decay before the first sample that counts
+            shapes += [table.decays(tau, index)[None] for index, tau in enumerate(taus)]
         missing = len(LINEAR_NUISANCES) - sum(map(len, shapes))
-        shapes.append(jnp.zeros((missing, remainder.size)))
-        return remainder, jnp.concatenate(shapes)[self._column_indices]
+        shapes.append(jnp.zeros((missing, signal.size)))
+        return table.observed - signal, jnp.concatenate(shapes)[self._column_indices], holds
+
+    def remainder_and_shapes(
+        self, inputs: ChannelInputs
+    ) -> tuple[Float[Array, " samples"], Float[Array, "columns samples"]]:
+        """Return channel minus signal, and the shapes of the `columns`, over the samples, before whitening."""
+        return self.samples.observed - self.signal(inputs), self.shapes(inputs)[self._column_indices]
 
     def rows_and_shapes(
         self, inputs: ChannelInputs
@@ -229,16 +240,19 @@ class ChannelLikelihood(eqx.Module):
         remainder = charges.observed - inputs.gain * later
         return remainder, jnp.reshape(jnp.asarray(shapes), (len(self.columns), remainder.size))
 
-    def _compressed_signal(self, inputs: ChannelInputs) -> tuple[Float[Array, " rows"], Array]:
+    def _compressed_signal(
+        self, inputs: ChannelInputs, terms: HighpassTerms | None
+    ) -> tuple[Float[Array, " rows"], Array]:
         """Return the signal in the coordinates of the compression, and whether the compression holds there."""
         compression = self.compression
-        assert compression is not None
         if isinstance(compression, Interpolation):
             at_points = {"time": compression.time, "rate": compression.rate, "effects": compression.effects}
             signal = self.signal(inputs, dataclasses.replace(self.samples, phases=None, **at_points))
             timing = jnp.stack([jnp.asarray(inputs.delay), jnp.asarray(inputs.clock)])
             return compression.to_rows @ signal, compression.holds(signal, timing)
-        terms, delay = self.electrical.terms(inputs), self.timing.shift + inputs.delay
+        assert compression is not None
+        assert terms is not None
+        delay = self.timing.shift + inputs.delay
         covered = compression.covers(jnp.stack(jnp.broadcast_arrays(*terms.tau)), delay)
         response = inputs.gain * compression.response(terms, delay, self.electrical.noise_gain)
         if self.samples.charges is not None:
@@ -274,7 +288,12 @@ class ChannelLikelihood(eqx.Module):
         Returns the whitened residuals, the coefficients in prior standard deviations, and the Cholesky factor of
         the posterior precision of the coefficients.
         """
-        remainder, shapes = self.residuals_and_shapes(inputs)
+        return self.fit_rows(*self.residuals_and_shapes(inputs), sigma)
+
+    def fit_rows(
+        self, remainder: Float[Array, " rows"], shapes: Float[Array, "columns rows"], sigma: ArrayLike
+    ) -> tuple[Float[Array, " rows"], Float[Array, " columns"], Float[Array, "columns columns"]]:
+        """Return `fit_nuisances` from the whitened `residuals_and_shapes`."""
         if self.expansion is not None and isinstance(self.compression, Compression):
             sigma, log_sigma = self.expansion.normal_sigma(sigma)
             remainder = remainder + log_sigma * self.compression.observed_slope
@@ -332,7 +351,8 @@ class ChannelLikelihood(eqx.Module):
 
     def log_likelihood(self, inputs: ChannelInputs, log_sigma: ArrayLike) -> Float[Array, ""]:
         """Return the log-likelihood up to a constant; NaN outside the range of the compression."""
-        remainder, beta, factor = self.fit_nuisances(inputs, jnp.exp(log_sigma))
+        remainder, shapes, holds = self._evaluate_rows(inputs)
+        remainder, beta, factor = self.fit_rows(remainder, shapes, jnp.exp(log_sigma))
         if self.is_student:
             misfit = jnp.sum(jnp.square(student_residual(remainder * jnp.exp(-log_sigma))))
         elif self.expansion is not None:
@@ -341,6 +361,4 @@ class ChannelLikelihood(eqx.Module):
             misfit = jnp.sum(jnp.square(remainder)) * jnp.exp(-2.0 * log_sigma)
         misfit = misfit + jnp.sum(jnp.square(beta))
         value = -0.5 * misfit - self.count * log_sigma - jnp.sum(jnp.log(jnp.diagonal(factor)))
-        if self.compression is None:
-            return value
-        return jnp.where(self._compressed_signal(inputs)[1], value, jnp.nan)
+        return value if self.compression is None else jnp.where(holds, value, jnp.nan)
