@@ -17,6 +17,7 @@ resistance R0, and parallel elements R‖C, one of which may be an interface gap
 from typing import Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -104,6 +105,17 @@ def _normalize_magnitude(gain: Array) -> tuple[Array, Array]:
     return jnp.where(some, gain / jnp.where(some, size, 1.0), 1.0), size
 
 
+@jax.jit
+def _divider(Csc: ArrayLike, Ci: ArrayLike) -> Array:
+    """Return Ci / (2 Ci + Csc)."""
+    Csc, Ci = jnp.asarray(Csc, dtype=float), jnp.asarray(Ci, dtype=float)
+    # dividing the smaller by the larger avoids cancellation in log-derivatives, and NaN from overflow
+    is_smaller = Csc <= Ci
+    skin = jnp.where(is_smaller, Csc, 0.0) / jnp.where(is_smaller, Ci, 1.0)
+    insulator = jnp.where(is_smaller, 0.0, Ci) / jnp.where(is_smaller, 1.0, Csc)
+    return jnp.where(is_smaller, 1.0 / (2.0 + skin), insulator / (1.0 + 2.0 * insulator))
+
+
 class FinalCircuit(Circuit):
     """Final circuit of the reference paper (Fig. 11): two equal skin layers Rsc‖Csc in series with Ci.
 
@@ -126,12 +138,7 @@ class FinalCircuit(Circuit):
     @property
     def g(self) -> ArrayLike:
         """High-frequency gain a / b = Ci / (2 Ci + Csc), at most 1/2."""
-        Csc, Ci = jnp.asarray(self.Csc, dtype=float), jnp.asarray(self.Ci, dtype=float)
-        # dividing the smaller by the larger avoids cancellation in log-derivatives, and NaN from overflow
-        is_smaller = Csc <= Ci
-        skin = jnp.where(is_smaller, Csc, 0.0) / jnp.where(is_smaller, Ci, 1.0)
-        insulator = jnp.where(is_smaller, 0.0, Ci) / jnp.where(is_smaller, 1.0, Csc)
-        return jnp.where(is_smaller, 1.0 / (2.0 + skin), insulator / (1.0 + 2.0 * insulator))
+        return _divider(self.Csc, self.Ci)
 
     @property
     def b(self) -> ArrayLike:
@@ -249,6 +256,7 @@ class Loop(Circuit):
         charging, Ri = 1j * jnp.asarray(omega) * self.insulator(), self.leak()
         return charging if Ri is None else charging + 1.0 / jnp.asarray(Ri)
 
+    @jax.jit
     def _impedance_ratios(self, omega: ArrayLike) -> list[Array]:
         """Return the loop's impedances over the insulator's, touching skin first; their real parts are >= 0."""
         admittance = self._insulator_admittance(omega)
@@ -405,6 +413,7 @@ def charge_ratios(acting: HighpassTerms, recorded: HighpassTerms) -> list[Array]
     ]
 
 
+@jax.jit
 def gain_at(terms: HighpassTerms, omega: ArrayLike) -> Complex[Array, "*shape"]:
     """Return the sum of `terms` at s = j omega (rad/s, >= 0)."""
     omega = jnp.asarray(omega)
@@ -416,6 +425,7 @@ def gain_at(terms: HighpassTerms, omega: ArrayLike) -> Complex[Array, "*shape"]:
     return total
 
 
+@jax.jit
 def highpass_gain(x: ArrayLike) -> Complex[Array, "*shape"]:
     """Return j x / (1 + j x) for x >= 0, without overflow at either end."""
     is_small, small, inverse = _split_range(x)
@@ -424,6 +434,7 @@ def highpass_gain(x: ArrayLike) -> Complex[Array, "*shape"]:
     return jnp.where(is_small, low * small + 1j * low, high + 1j * high * inverse)
 
 
+@jax.jit
 def highpass_amplitude(x: ArrayLike) -> Float[Array, "*shape"]:
     """Return |j x / (1 + j x)| for x >= 0, in forms whose derivatives do not cancel."""
     is_small, small, inverse = _split_range(x)

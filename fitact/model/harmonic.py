@@ -5,6 +5,8 @@ coefficients c_k = 1/T int V e^{-jkwt} dt of linear pieces have a closed form. A
 J e^{-jkwt} / (jkwT). A piece adds (its rise) x (the mean of e^{-jkwt} over it) / (jkwT).
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,6 +57,7 @@ def harmonic_error(circuit: Circuit, drive: Drive, harmonics: int, *, channel: C
     return jnp.where(share > 0.0, jnp.sqrt(jnp.where(share > 0.0, share, 1.0)), 0.0)
 
 
+@jax.jit
 def harmonic_sum(amplitude: Complex[Array, " harmonics"], drive: Drive, time: ArrayLike) -> Float[Array, "*shape"]:
     """Return 2 Re sum_k amplitude[k - 1] e^{jkwt}, one harmonic at a time to save memory."""
     cycles = _cycles(drive, jnp.asarray(time, dtype=float))
@@ -69,6 +72,7 @@ def harmonic_sum(amplitude: Complex[Array, " harmonics"], drive: Drive, time: Ar
     return lax.scan(add, jnp.zeros_like(cycles), (order, amplitude))[0]
 
 
+@partial(jax.jit, static_argnames="harmonics")
 def fourier_coefficients(drive: Drive, harmonics: int) -> Complex[Array, " harmonics"]:
     """Return c_k (V) for k = 1 to `harmonics`, where the drive is its mean plus 2 Re sum_k c_k e^{jkwt}."""
     order = jnp.arange(1, harmonics + 1, dtype=float)

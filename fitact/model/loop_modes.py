@@ -70,6 +70,7 @@ class Modes(NamedTuple):
         return HighpassTerms(tuple(self.voltages[index]), tuple(self.tau), None, direct)
 
 
+@jax.jit
 def modes_without_resistance(Ci: ArrayLike, Ri: ArrayLike | None, R: Array, C: Array) -> Modes:
     """Solve  T x' + x = L^T 1 (Ci V' + V / Ri),  T = L^T (diag(C) + Ci 1 1^T) L,  with v = L x over the elements.
 
@@ -95,6 +96,7 @@ def modes_without_resistance(Ci: ArrayLike, Ri: ArrayLike | None, R: Array, C: A
     return Modes(tau, factor @ modes * drive, drive**2, rate, direct, direct_current)
 
 
+@jax.jit
 def modes_with_resistance(Ci: ArrayLike, Ri: ArrayLike | None, R0: ArrayLike, R: Array, C: Array) -> Modes:
     """Solve  T x' + x = sqrt(C) d V,  T = sqrt(C) P sqrt(C),  with x = sqrt(C) v over the elements and the insulator.
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -163,6 +164,7 @@ def chebyshev(count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.cos(angle), matrix
 
 
+@functools.partial(jax.jit, static_argnames="terms")
 def chebyshev_polynomials(x: Array, terms: int) -> Float[Array, " terms"]:
     """Return the first Chebyshev polynomials at x."""
 

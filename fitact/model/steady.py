@@ -239,6 +239,7 @@ def _even_series(z: Array, first: int) -> Array:
     return total
 
 
+@jax.jit
 def _straight_pieces(pieces: LinearPieces, tau: ArrayLike) -> Array:
     """Return S of any drive made of linear pieces."""
     length, rise = jnp.diff(pieces.knots), pieces.end - pieces.start
@@ -283,6 +284,7 @@ def _has_impulses(drive: Drive, rate: ArrayLike) -> Array:
     return jnp.any(rate * (start - jnp.roll(end, 1)) != 0.0) | (jnp.any(inside) & (jnp.asarray(rate) != 0.0))
 
 
+@jax.jit
 def _extremes(terms: HighpassTerms, pieces: LinearPieces) -> Array:
     """Return the response at both ends of every piece and at the extremes in between.
 
