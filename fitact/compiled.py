@@ -148,6 +148,11 @@ def jit(
     return run
 
 
+# Decorator of small functions: a call outside a program is one program for each shape, and not one for each operation;
+# within a program, each is traced once, and XLA sees its operations as if it were not decorated.
+jit_inline = functools.partial(jax.jit, inline=True)
+
+
 def solve_lower(factor: ArrayLike, values: Array, *, transposed: bool = False) -> Array:
     """Return the solution of a lower triangular system; `jax.scipy.linalg` takes 0.05 s to import."""
     columns = values if values.ndim > 1 else values[:, None]

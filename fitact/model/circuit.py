@@ -17,13 +17,13 @@ resistance R0, and parallel elements R‖C, one of which may be an interface gap
 from typing import Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
+from fitact.compiled import jit_inline
 from fitact.errors import InputError
 from fitact.model.loop_modes import HighpassTerms, Modes, modes_with_resistance, modes_without_resistance
 
@@ -105,7 +105,7 @@ def _normalize_magnitude(gain: Array) -> tuple[Array, Array]:
     return jnp.where(some, gain / jnp.where(some, size, 1.0), 1.0), size
 
 
-@jax.jit
+@jit_inline
 def _divider(Csc: ArrayLike, Ci: ArrayLike) -> Array:
     """Return Ci / (2 Ci + Csc)."""
     Csc, Ci = jnp.asarray(Csc, dtype=float), jnp.asarray(Ci, dtype=float)
@@ -256,7 +256,7 @@ class Loop(Circuit):
         charging, Ri = 1j * jnp.asarray(omega) * self.insulator(), self.leak()
         return charging if Ri is None else charging + 1.0 / jnp.asarray(Ri)
 
-    @jax.jit
+    @jit_inline
     def _impedance_ratios(self, omega: ArrayLike) -> list[Array]:
         """Return the loop's impedances over the insulator's, touching skin first; their real parts are >= 0."""
         admittance = self._insulator_admittance(omega)
@@ -413,7 +413,7 @@ def charge_ratios(acting: HighpassTerms, recorded: HighpassTerms) -> list[Array]
     ]
 
 
-@jax.jit
+@jit_inline
 def gain_at(terms: HighpassTerms, omega: ArrayLike) -> Complex[Array, "*shape"]:
     """Return the sum of `terms` at s = j omega (rad/s, >= 0)."""
     omega = jnp.asarray(omega)
@@ -425,7 +425,7 @@ def gain_at(terms: HighpassTerms, omega: ArrayLike) -> Complex[Array, "*shape"]:
     return total
 
 
-@jax.jit
+@jit_inline
 def highpass_gain(x: ArrayLike) -> Complex[Array, "*shape"]:
     """Return j x / (1 + j x) for x >= 0, without overflow at either end."""
     is_small, small, inverse = _split_range(x)
@@ -434,7 +434,7 @@ def highpass_gain(x: ArrayLike) -> Complex[Array, "*shape"]:
     return jnp.where(is_small, low * small + 1j * low, high + 1j * high * inverse)
 
 
-@jax.jit
+@jit_inline
 def highpass_amplitude(x: ArrayLike) -> Float[Array, "*shape"]:
     """Return |j x / (1 + j x)| for x >= 0, in forms whose derivatives do not cancel."""
     is_small, small, inverse = _split_range(x)

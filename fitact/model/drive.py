@@ -9,7 +9,6 @@ there.
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -17,6 +16,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
+from fitact.compiled import jit_inline
 from fitact.errors import InputError
 
 
@@ -46,7 +46,7 @@ class LinearPieces(NamedTuple):
     start: Float[Array, " pieces"]  # V
     end: Float[Array, " pieces"]  # V
 
-    @jax.jit
+    @jit_inline
     def slopes(self) -> Float[Array, " pieces"]:
         """Return the slopes in V/s, with 0 for a piece of zero length (a jump)."""
         length = jnp.diff(self.knots)
@@ -91,7 +91,7 @@ class Periodic(Drive):
         """Phase as a time, s."""
         return self.phase / (2.0 * np.pi) * self.period
 
-    @jax.jit
+    @jit_inline
     def cycle(self, time: ArrayLike) -> tuple[Array, Array]:
         """Return the cycles since the last start of a period, in [0, 1), and their rounding error."""
         elapsed, ahead = _as_float(time) * self.frequency, self.phase / (2.0 * np.pi)
@@ -108,7 +108,7 @@ class PiecewiseLinear(Periodic):
         """Return the pieces of one period."""
         raise NotImplementedError
 
-    @jax.jit
+    @jit_inline
     def locate(self, time: ArrayLike) -> tuple[Array, Array]:
         """Return the piece that contains `time`, and the time since the start of that piece (s)."""
         knots = self.pieces().knots
@@ -118,7 +118,7 @@ class PiecewiseLinear(Periodic):
         piece = sum((cycle + slack >= start).astype(int) for start in starts)
         return piece, jnp.maximum(cycle * knots[-1] - knots[piece], 0.0)
 
-    @jax.jit
+    @jit_inline
     def value(self, time: ArrayLike) -> Float[Array, "*shape"]:
         """Return V at `time`."""
         pieces = self.pieces()
@@ -196,7 +196,7 @@ class Sine(Periodic):
     offset: ArrayLike = 0.0
     phase: ArrayLike = 0.0
 
-    @jax.jit
+    @jit_inline
     def value(self, time: ArrayLike) -> Float[Array, "*shape"]:
         """Return V at `time`."""
         cycle, _ = self.cycle(time)
@@ -255,7 +255,7 @@ class Multitone(Periodic):
         phases = jnp.stack(list(map(jnp.asarray, self.phases or (0.0,) * len(self.orders))))
         return jnp.stack(list(map(jnp.asarray, self.amplitudes))) * jnp.exp(1j * phases)
 
-    @jax.jit
+    @jit_inline
     def value(self, time: ArrayLike) -> Float[Array, "*shape"]:
         """Return V at `time`."""
         return self.offset + sum((tone.value(time) for tone in self.tones()), jnp.zeros(()))
@@ -297,7 +297,7 @@ class InterpolatedDrive(Drive):
         close = jnp.maximum(knots[0] + self.period, knots[-1])
         return LinearPieces(jnp.append(knots, close), values, jnp.append(values[1:], values[0]))
 
-    @jax.jit
+    @jit_inline
     def locate(self, time: ArrayLike) -> tuple[Array, Array]:
         """Return the piece that contains `time`, and the time since its start (s; negative before the first)."""
         knots = self.pieces().knots
@@ -312,7 +312,7 @@ class InterpolatedDrive(Drive):
     def _slack(self, time: Array) -> Array:
         return _rounding_error(jnp.maximum(jnp.abs(time), jnp.abs(self.start_time)))
 
-    @jax.jit
+    @jit_inline
     def value(self, time: ArrayLike) -> Float[Array, "*shape"]:
         """Return V at `time`, by linear interpolation."""
         pieces = self.pieces()
@@ -408,7 +408,7 @@ class Burst(Drive):
         """Return whether the burst has ended; a time equal to the end within rounding counts as ended."""
         return is_reached(jnp.asarray(time, dtype=float) * self.wave.frequency, self.cycles)
 
-    @jax.jit
+    @jit_inline
     def value(self, time: ArrayLike) -> Float[Array, "*shape"]:
         """Return V at `time`."""
         time = jnp.asarray(time, dtype=float)

@@ -14,6 +14,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
+from fitact.compiled import jit_inline
 from fitact.errors import InputError
 from fitact.model.circuit import Channel, Circuit, passes_direct_current
 from fitact.model.drive import Drive, InterpolatedDrive, Multitone, Periodic, PiecewiseLinear, Sine
@@ -57,7 +58,7 @@ def harmonic_error(circuit: Circuit, drive: Drive, harmonics: int, *, channel: C
     return jnp.where(share > 0.0, jnp.sqrt(jnp.where(share > 0.0, share, 1.0)), 0.0)
 
 
-@jax.jit
+@jit_inline
 def harmonic_sum(amplitude: Complex[Array, " harmonics"], drive: Drive, time: ArrayLike) -> Float[Array, "*shape"]:
     """Return 2 Re sum_k amplitude[k - 1] e^{jkwt}, one harmonic at a time to save memory."""
     cycles = _cycles(drive, jnp.asarray(time, dtype=float))
@@ -72,7 +73,7 @@ def harmonic_sum(amplitude: Complex[Array, " harmonics"], drive: Drive, time: Ar
     return lax.scan(add, jnp.zeros_like(cycles), (order, amplitude))[0]
 
 
-@partial(jax.jit, static_argnames="harmonics")
+@partial(jit_inline, static_argnames="harmonics")
 def fourier_coefficients(drive: Drive, harmonics: int) -> Complex[Array, " harmonics"]:
     """Return c_k (V) for k = 1 to `harmonics`, where the drive is its mean plus 2 Re sum_k c_k e^{jkwt}."""
     order = jnp.arange(1, harmonics + 1, dtype=float)

@@ -13,6 +13,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from fitact.compiled import jit_inline
+
 
 class HighpassTerms(NamedTuple):
     """direct + sum_k weight[k] s tau[k] / (1 + s tau[k]) + rate s."""
@@ -70,7 +72,7 @@ class Modes(NamedTuple):
         return HighpassTerms(tuple(self.voltages[index]), tuple(self.tau), None, direct)
 
 
-@jax.jit
+@jit_inline
 def modes_without_resistance(Ci: ArrayLike, Ri: ArrayLike | None, R: Array, C: Array) -> Modes:
     """Solve  T x' + x = L^T 1 (Ci V' + V / Ri),  T = L^T (diag(C) + Ci 1 1^T) L,  with v = L x over the elements.
 
@@ -96,7 +98,7 @@ def modes_without_resistance(Ci: ArrayLike, Ri: ArrayLike | None, R: Array, C: A
     return Modes(tau, factor @ modes * drive, drive**2, rate, direct, direct_current)
 
 
-@jax.jit
+@jit_inline
 def modes_with_resistance(Ci: ArrayLike, Ri: ArrayLike | None, R0: ArrayLike, R: Array, C: Array) -> Modes:
     """Solve  T x' + x = sqrt(C) d V,  T = sqrt(C) P sqrt(C),  with x = sqrt(C) v over the elements and the insulator.
 

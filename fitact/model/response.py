@@ -18,6 +18,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
+from fitact.compiled import jit_inline
 from fitact.errors import InputError
 from fitact.model.chirp import Chirp, evaluate_polynomials, particular_solution
 from fitact.model.circuit import Channel, Circuit, HighpassTerms, gain_at, highpass_amplitude
@@ -216,7 +217,7 @@ def _steady_response(
     return lambda time: _propagate(drive, time, tau, u)
 
 
-@partial(jax.jit, static_argnames="part")
+@partial(jit_inline, static_argnames="part")
 def knot_values(pieces: LinearPieces, tau: ArrayLike, first: ArrayLike, part: int = 32_768) -> Float[Array, " pieces"]:
     """Return u just after the start of each piece, given u just after the first start.
 
@@ -242,7 +243,7 @@ def knot_values(pieces: LinearPieces, tau: ArrayLike, first: ArrayLike, part: in
     return jnp.concatenate([first[None].astype(u.dtype), u, parts.ravel(), rest_of_it])
 
 
-@jax.jit
+@jit_inline
 def recurrence(
     decay: Float[Array, " n"], gain: Float[Array, "*shape n"], first: Float[Array, "*shape"]
 ) -> Float[Array, "*shape n"]:
@@ -271,7 +272,7 @@ def recurrence(
     return (decays * starts + gains).T.reshape(-1)[: decay.size - missing]
 
 
-@jax.jit
+@jit_inline
 def _propagate(drive: PiecewiseLinear | InterpolatedDrive, time: Array, tau: ArrayLike, u: Array) -> Array:
     """Return u(t), given its values at the starts of the pieces."""
     piece, since = drive.locate(time)
@@ -297,7 +298,7 @@ def steady_knot_values(pieces: LinearPieces, tau: ArrayLike) -> Float[Array, " p
     return knot_values(pieces, tau, _steady_initial_value(pieces, tau))
 
 
-@jax.jit
+@jit_inline
 def _steady_initial_value(pieces: LinearPieces, tau: ArrayLike) -> Array:
     """Return u just after the start of a period, in the steady state.
 
@@ -321,7 +322,7 @@ def _steady_initial_value(pieces: LinearPieces, tau: ArrayLike) -> Array:
     return jnp.where(x < 1.0, slow, fast)
 
 
-@jax.jit
+@jit_inline
 def _sine(drive: Sine, tau: ArrayLike, time: Array) -> Array:
     x = 2.0 * np.pi * jnp.asarray(drive.frequency) * tau
     height = 0.5 * jnp.asarray(drive.peak_to_peak) * highpass_amplitude(x)
@@ -345,7 +346,7 @@ def _chirp(drive: Chirp, time: Array, tau: Array) -> Array:
 
 
 @jax.custom_jvp
-@jax.jit
+@jit_inline
 def phi(x: ArrayLike) -> Array:
     """Return (1 - e^{-x}) / x for x >= 0."""
     x = jnp.asarray(x, dtype=float)
@@ -363,7 +364,7 @@ def psi(x: ArrayLike) -> Array:
     return phi(x) * (0.5 + half_langevin(x))
 
 
-@jax.jit
+@jit_inline
 def log_phi_derivative(x: ArrayLike) -> Array:
     """Return the derivative of log phi(x) for x >= 0; it goes from -1/2 towards -1/x."""
     x = jnp.asarray(x, dtype=float)
@@ -371,7 +372,7 @@ def log_phi_derivative(x: ArrayLike) -> Array:
     return jnp.where(x < 2.0, half_langevin(x) - 0.5, jnp.exp(-large) / (1.0 - jnp.exp(-large)) - 1.0 / large)
 
 
-@jax.jit
+@jit_inline
 def half_langevin(x: ArrayLike) -> Array:
     """Return 1 / (e^x - 1) - 1/x + 1/2 for x >= 0; it goes from x/12 towards 1/2."""
     x = jnp.asarray(x, dtype=float)

@@ -10,14 +10,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from fitact.compiled import BatchEvaluator
+from fitact.compiled import BatchEvaluator, jit_inline
 from fitact.model.circuit import INFINITE_RATIO, HighpassTerms
 from fitact.model.drive import Drive
 from fitact.model.harmonic import mean_voltage
@@ -164,7 +163,7 @@ def chebyshev(count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.cos(angle), matrix
 
 
-@functools.partial(jax.jit, static_argnames="terms")
+@functools.partial(jit_inline, static_argnames="terms")
 def chebyshev_polynomials(x: Array, terms: int) -> Float[Array, " terms"]:
     """Return the first Chebyshev polynomials at x."""
 

@@ -17,6 +17,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float
 
+from fitact.compiled import jit_inline
 from fitact.errors import InputError
 from fitact.model.circuit import Channel, Circuit, HighpassTerms, highpass_amplitude
 from fitact.model.drive import (
@@ -239,7 +240,7 @@ def _even_series(z: Array, first: int) -> Array:
     return total
 
 
-@jax.jit
+@jit_inline
 def _straight_pieces(pieces: LinearPieces, tau: ArrayLike) -> Array:
     """Return S of any drive made of linear pieces."""
     length, rise = jnp.diff(pieces.knots), pieces.end - pieces.start
@@ -284,7 +285,7 @@ def _has_impulses(drive: Drive, rate: ArrayLike) -> Array:
     return jnp.any(rate * (start - jnp.roll(end, 1)) != 0.0) | (jnp.any(inside) & (jnp.asarray(rate) != 0.0))
 
 
-@jax.jit
+@jit_inline
 def _extremes(terms: HighpassTerms, pieces: LinearPieces) -> Array:
     """Return the response at both ends of every piece and at the extremes in between.
 
