@@ -89,8 +89,8 @@ def fit_records(
 ) -> Fit:
     """Fit records as `fit` does.
 
-    `drives` are the drives of the first records if they were chosen already; `excluded` are masks of
-    samples (with padding), one for each channel, that do not enter the likelihood.
+    `drives` are the drives of the first records if they were chosen already; `excluded` are masks of samples (with
+    padding), one for each channel, that do not enter the likelihood.
     """
     if not 0.0 <= tolerance < math.inf:
         raise InputError(f"tolerance = {tolerance}: give an error of the log-likelihood, 0.001 or so, or 0 for none")
