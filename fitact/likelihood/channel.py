@@ -206,12 +206,15 @@ class ChannelLikelihood(eqx.Module):
             rows = self.remainder_and_shapes if samples.charges is None else self.rows_and_shapes
             remainder, shapes = rows(inputs)
             return whiten(remainder), whiten(shapes), True
-        terms = None if isinstance(table, Interpolation) else self.electrical.terms(inputs)
-        signal, holds = self._compressed_signal(inputs, terms)
         shapes = [table.baseline]
-        if terms is not None and isinstance(table, Compression) and not isinstance(table, GridCompression):
-            taus = terms.without_fastest(table.short).tau  # those decay before the first sample that counts
-            shapes += [table.decays(tau, index)[None] for index, tau in enumerate(taus)]
+        if isinstance(table, Interpolation):
+            signal, holds = self._interpolated_signal(table, inputs)
+        else:
+            terms = self.electrical.terms(inputs)
+            signal, holds = self._tabulated_signal(table, inputs, terms)
+            if not isinstance(table, GridCompression):
+                taus = terms.without_fastest(table.short).tau  # those decay before the first sample that counts
+                shapes += [table.decays(tau, index)[None] for index, tau in enumerate(taus)]
         missing = len(LINEAR_NUISANCES) - sum(map(len, shapes))
         shapes.append(jnp.zeros((missing, signal.size)))
         return table.observed - signal, jnp.concatenate(shapes)[self._column_indices], holds
@@ -240,25 +243,24 @@ class ChannelLikelihood(eqx.Module):
         remainder = charges.observed - inputs.gain * later
         return remainder, jnp.reshape(jnp.asarray(shapes), (len(self.columns), remainder.size))
 
-    def _compressed_signal(
-        self, inputs: ChannelInputs, terms: HighpassTerms | None
+    def _interpolated_signal(self, points: Interpolation, inputs: ChannelInputs) -> tuple[Float[Array, " rows"], Array]:
+        """Return the signal in the coordinates of an interpolation, and whether it holds there."""
+        at_points = {"time": points.time, "rate": points.rate, "effects": points.effects}
+        signal = self.signal(inputs, dataclasses.replace(self.samples, phases=None, **at_points))
+        timing = jnp.stack([jnp.asarray(inputs.delay), jnp.asarray(inputs.clock)])
+        return points.to_rows @ signal, points.holds(signal, timing)
+
+    def _tabulated_signal(
+        self, table: Compression, inputs: ChannelInputs, terms: HighpassTerms
     ) -> tuple[Float[Array, " rows"], Array]:
-        """Return the signal in the coordinates of the compression, and whether the compression holds there."""
-        compression = self.compression
-        if isinstance(compression, Interpolation):
-            at_points = {"time": compression.time, "rate": compression.rate, "effects": compression.effects}
-            signal = self.signal(inputs, dataclasses.replace(self.samples, phases=None, **at_points))
-            timing = jnp.stack([jnp.asarray(inputs.delay), jnp.asarray(inputs.clock)])
-            return compression.to_rows @ signal, compression.holds(signal, timing)
-        assert compression is not None
-        assert terms is not None
+        """Return the signal in the coordinates of a table, and whether the table covers it."""
         delay = self.timing.shift + inputs.delay
-        covered = compression.covers(jnp.stack(jnp.broadcast_arrays(*terms.tau)), delay)
-        response = inputs.gain * compression.response(terms, delay, self.electrical.noise_gain)
+        covered = table.covers(jnp.stack(jnp.broadcast_arrays(*terms.tau)), delay)
+        response = inputs.gain * table.response(terms, delay, self.electrical.noise_gain)
         if self.samples.charges is not None:
-            response = response + inputs.gain * inputs.delay * compression.rows_delay_derivative(terms)
+            response = response + inputs.gain * inputs.delay * table.rows_delay_derivative(terms)
         if inputs.effects is not None:
-            response = response + inputs.effects @ compression.effects
+            response = response + inputs.effects @ table.effects
         return response, jnp.all(covered)
 
     def whitened_observed(self) -> Float[Array, " rows"]:

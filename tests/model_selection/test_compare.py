@@ -163,15 +163,15 @@ def test_refused():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("other", "excluded"),
-    [(lambda: sine_scene(noise_model="ar1"), 1), (lambda: sine_scene("measured"), 12)],
+    [({"noise_model": "ar1"}, 1), ({"waveform": "measured"}, 12)],
     ids=["ar1", "recorded drive"],
 )
 def test_models_that_leave_out_different_samples_are_compared_by_those_of_both(other, excluded):
     ideal, rng = sine_record(0), np.random.default_rng(1)
-    rounded = {name: np.round(ideal[name] / 0.05) * 0.05 for name in ("V", "Vsc")}
-    rounded["V"] = rounded["V"] + 0.1 * rng.standard_normal(SAMPLES)
+    noisy = {"V": ideal["V"] + 0.1 * rng.standard_normal(SAMPLES), "Vsc": ideal["Vsc"]}
+    rounded = {name: np.round(values / 0.05) * 0.05 for name, values in noisy.items()}
     made = fitact.Record.from_arrays(ideal.time, **rounded)
-    found = fitact.compare(made, {"first": sine_scene(), "other": other()})
+    found = fitact.compare(made, {"first": sine_scene(), "other": sine_scene(**other)})
     counts = [int(model.fit.likelihood.channels[0].count) for model in found.models]
     assert counts == [SAMPLES - excluded] * 2
     assert found.preferred != "other"  # another model of the same noise, or a noisy drive, is no better
