@@ -276,7 +276,8 @@ def _evaluate_optimum(
     def quantities(theta: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         circuit = model.circuit(theta)
         scale = force_constant(derive.geometry.contact(circuit))
-        values = derive.voltage(circuit, theta, sigma[None]), jnp.log(jnp.stack([circuit.g, circuit.b, scale]))
+        charges = derive.charges(circuit, theta, sigma[None])
+        values = derive.voltage(circuit, theta, charges), jnp.log(jnp.stack([circuit.g, circuit.b, scale]))
         return values, values
 
     (voltage_slopes, log_slopes), (voltage, logs) = jax.jacfwd(quantities, has_aux=True)(theta)

@@ -93,7 +93,7 @@ class StatedDriveProblem(BatchProblem):
         coordinates = self.basis.project(observed)
         inputs = self.make_inputs(coordinates, MIN_RELATIVE_NOISE * height)
         optima, accepted = self.find_optima(inputs, noise)
-        logs, gradients = _log_derived(self.derive, optima.theta, optima.sigma)
+        logs, gradients = _log_derived(self.derive, optima.theta)
         square, tests = optima.sum_of_squares, None
         if whiteness:
             fitted, functions = optima.fitted[:, : len(self.basis.compression.signal)], self.basis.functions
@@ -165,5 +165,6 @@ def _residual_statistics(
 
 
 @functools.partial(jit, fast=True)
-def _log_derived(derive: DerivedQuantities, theta: Array, sigma: Array) -> tuple[Array, Array]:
-    return jax.vmap(lambda theta, sigma: log_derivatives(derive, theta, sigma[None]))(theta, sigma)
+def _log_derived(derive: DerivedQuantities, theta: Array) -> tuple[Array, Array]:
+    logs, (gradients, _) = jax.vmap(lambda theta: log_derivatives(derive, theta, None))(theta)
+    return logs, gradients

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import equinox as eqx
 import jax
@@ -15,12 +15,19 @@ from jaxtyping import Array, Float
 from fitact.compiled import BatchEvaluator, as_arrays, double_precision, jit, pad_samples, pad_weight
 from fitact.data.record import Record
 from fitact.errors import InputError
-from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.likelihood import Likelihood
-from fitact.likelihood.observable import CHARGES, FIRST_CHARGE, LINEAR_NUISANCES, ChannelInputs, charge_decays
-from fitact.model.circuit import Circuit, charge_ratios
+from fitact.likelihood.observable import CHARGES, FIRST_CHARGE, LINEAR_NUISANCES, charge_decays
+from fitact.model.circuit import Channel, Circuit, charge_ratios
 from fitact.model.drive import Drive, Multitone, Periodic, PiecewiseLinear, Sampled, Sine
-from fitact.model.force import Geometry, electrostatic_force, friction, mean_force, peak_force, summarize
+from fitact.model.force import (
+    FRICTION_PARAMETERS,
+    Geometry,
+    electrostatic_force,
+    friction,
+    mean_force,
+    peak_force,
+    summarize,
+)
 from fitact.model.response import response
 from fitact.model.response_table import ResponseTable
 from fitact.model.skin import WithSkin
@@ -28,6 +35,30 @@ from fitact.problem.drive_choice import DriveModel, has_ideal_edges, whole_perio
 from fitact.scene.scene import Scene
 
 DERIVED_NAMES = ("g", "b", "force_mean", "force_peak", "force_rms", "friction_mean")
+
+
+class UnknownCharges(NamedTuple):
+    """Unknown charges at the first sample of a fit, at its optimum and to first order in theta around it."""
+
+    voltages: Float[np.ndarray, " charges"]  # of the channel that was fitted, without its gain, V or A
+    slopes: Float[np.ndarray, "charges parameters"]
+
+    @classmethod
+    def from_nuisances(
+        cls,
+        likelihood: Likelihood,
+        theta: Float[np.ndarray, " parameters"],
+        nuisances: Float[np.ndarray, " columns"],
+        slopes: Float[np.ndarray, "columns parameters"],
+    ) -> Self:
+        """Return the charges of the first channel from its linear nuisances and their derivatives in theta."""
+        channel = likelihood.channels[0]
+        log_gain = np.array([dict(channel.gains).get(name, 0.0) for name in likelihood.names])
+        unit = channel.linear_sd[list(channel.columns)] / math.exp(log_gain @ theta)
+        found = np.zeros((len(LINEAR_NUISANCES), 1 + theta.size))
+        found[list(channel.columns)] = unit[:, None] * np.column_stack([nuisances, slopes])
+        voltages, slopes = np.split(found[FIRST_CHARGE : FIRST_CHARGE + len(CHARGES)], [1], axis=1)
+        return cls(voltages[:, 0], slopes - voltages * log_gain)
 
 
 class DerivedQuantities(eqx.Module):
@@ -47,8 +78,20 @@ class DerivedQuantities(eqx.Module):
     geometry: Geometry  # geometry of the contact
     coefficient: ArrayLike  # coefficient of friction
     normal_force: ArrayLike  # normal force, N
+    begin: ArrayLike  # time of the record's first sample, s
     steady_state: bool = eqx.field(static=True)
     charge: bool = eqx.field(static=True)  # whether the unknown charge at the first sample matters
+    channel: Channel = eqx.field(static=True)  # the first channel, which shows that charge
+    # names of the coordinates that act on the gain of the indicated V, each with its power
+    drive_gains: tuple[tuple[str, float], ...] = eqx.field(static=True)
+
+    def without_data(self) -> tuple[Self, list[int]]:
+        """Return the quantities without the channels, and the coordinates of theta on which they depend.
+
+        They still serve for `evaluate`, by one program for all records of a circuit.
+        """
+        likelihood, kept = self.likelihood.for_circuit(*FRICTION_PARAMETERS, *(name for name, _ in self.drive_gains))
+        return dataclasses.replace(self, likelihood=likelihood), kept
 
     def tabulate(self, points: Float[np.ndarray, "n parameters"]) -> Self:
         """Return the quantities with a table for all circuits at the points theta, where it saves time.
@@ -58,8 +101,8 @@ class DerivedQuantities(eqx.Module):
         is_closed = self.steady_state and isinstance(self.drive, Periodic)
         if is_closed or isinstance(self.drive, ResponseTable) or isinstance(self.likelihood.template, WithSkin):
             return self
-        begin, tau_range = float(self.likelihood.channels[0].samples.time[0]), self.likelihood.tau_range(points)
-        table = ResponseTable.from_drive(self.drive, self.time, begin, tau_range, self.steady_state)
+        tau_range = self.likelihood.tau_range(points)
+        table = ResponseTable.from_drive(self.drive, self.time, float(self.begin), tau_range, self.steady_state)
         return self if table is None else dataclasses.replace(self, drive=table)
 
     def force(
@@ -70,20 +113,33 @@ class DerivedQuantities(eqx.Module):
         `deviate` holds standard normal numbers (channels, `LINEAR_NUISANCES`) that draw the charges from their
         posterior; None gives their mean.
         """
-        return self._force(self.likelihood.circuit(theta), theta, sigma, deviate)
+        circuit = self.likelihood.circuit(theta)
+        return self._force(circuit, theta, self.charges(circuit, theta, sigma, deviate))
 
-    def _force(self, circuit: Circuit, theta: Array, sigma: Array, deviate: Array | None) -> Float[Array, " times"]:
+    def _force(self, circuit: Circuit, theta: Array, charges: Array | None) -> Float[Array, " times"]:
         contact = self.geometry.contact(self.likelihood.finger(circuit))
-        return electrostatic_force(self.voltage(circuit, theta, sigma, deviate), contact)
+        return electrostatic_force(self.voltage(circuit, theta, charges), contact)
 
     def _drive_gain(self, theta: Array) -> ArrayLike:
         """Return the ratio between indicated and true V."""
-        names, gains = self.likelihood.names, [each.drive_gains for each in self.likelihood.channels[:1]]
-        return jnp.exp(sum(power * theta[names.index(name)] for each in gains for name, power in each))
+        names = self.likelihood.names
+        return jnp.exp(sum(power * theta[names.index(name)] for name, power in self.drive_gains))
 
-    def voltage(
+    def charges(
         self, circuit: Circuit, theta: Array, sigma: Array, deviate: Array | None = None
-    ) -> Float[Array, " times"]:
+    ) -> Float[Array, " charges"] | None:
+        """Return what unknown charges add to the first channel at its first sample, without its gain.
+
+        None if they do not matter. `circuit` is that at theta.
+        """
+        if not self.charge:
+            return None
+        channel, first = self.likelihood.channels[0], None if deviate is None else deviate[0]
+        inputs = self.likelihood.make_inputs(circuit, theta, channel)
+        sizes = channel.sample_nuisances(inputs, sigma[0], first) * channel.linear_sd
+        return sizes[FIRST_CHARGE : FIRST_CHARGE + len(CHARGES)] / inputs.gain
+
+    def voltage(self, circuit: Circuit, theta: Array, charges: Array | None) -> Float[Array, " times"]:
         """Return the voltage that generates the force at `time`, V; `circuit` is that at theta."""
         finger = self.likelihood.finger(circuit)
         acting = self.geometry.contact(finger).channel
@@ -91,37 +147,33 @@ class DerivedQuantities(eqx.Module):
             voltage = self.drive.response(finger.channel_terms(acting))
         else:
             voltage = response(finger, self.drive, self.time, steady_state=self.steady_state, channel=acting)
-        if self.charge:
-            channel = self.likelihood.channels[0]
-            inputs = self.likelihood.make_inputs(circuit, theta, channel)
-            voltage = voltage + self._charges(channel, inputs, sigma[0], deviate)
+        if charges is not None:
+            voltage = voltage + self._decay(circuit, charges)
         return voltage / self._drive_gain(theta)
 
-    def _charges(
-        self, channel: ChannelLikelihood, inputs: ChannelInputs, sigma: Array, deviate: Array | None
-    ) -> Float[Array, " times"]:
-        """Return the contribution of unknown charges at the first sample to the voltage that generates the force.
+    def _decay(self, circuit: Circuit, charges: Array) -> Float[Array, " times"]:
+        """Return the contribution of `charges` to the voltage that generates the force.
 
         A charge that stays on a gap is not included, because no channel shows it.
         """
-        first = None if deviate is None else deviate[0]
-        sizes = (channel.sample_nuisances(inputs, sigma, first) * channel.linear_sd)[
-            FIRST_CHARGE : FIRST_CHARGE + len(CHARGES)
-        ]
-        acting = self.geometry.contact(inputs.circuit).channel
-        terms = (inputs.circuit.channel_terms(name) for name in (acting, channel.channel))
+        acting = self.geometry.contact(circuit).channel
+        terms = (circuit.channel_terms(name) for name in (acting, self.channel))
         ratios = jnp.stack(charge_ratios(*terms))
-        sizes = sizes[: ratios.size] * ratios / inputs.gain
+        sizes = charges[: ratios.size] * ratios
         if isinstance(self.drive, ResponseTable):
-            return self.drive.decays(inputs.circuit.terms().tau, sizes)
-        return sizes @ charge_decays(inputs.circuit, self.time - channel.samples.time[0])[: ratios.size]
+            return self.drive.decays(circuit.terms().tau, sizes)
+        return sizes @ charge_decays(circuit, self.time - self.begin)[: ratios.size]
 
     def __call__(
         self, theta: Float[Array, " parameters"], sigma: Float[Array, " channels"], deviate: Array | None = None
     ) -> Float[Array, " derived"]:
         """Return the quantities of `DERIVED_NAMES`, in SI units."""
+        return self.evaluate(theta, self.charges(self.likelihood.circuit(theta), theta, sigma, deviate))
+
+    def evaluate(self, theta: Float[Array, " parameters"], charges: Array | None) -> Float[Array, " derived"]:
+        """Return the quantities from theta and the `charges` there."""
         circuit = self.likelihood.circuit(theta)
-        force = summarize(self._force(circuit, theta, sigma, deviate), self.weight)
+        force = summarize(self._force(circuit, theta, charges), self.weight)
         finger, scale = self.likelihood.finger(circuit), self._drive_gain(theta) ** -2.0
         if self.steady_state and isinstance(self.drive, Periodic):  # only the rms needs quadrature
             exact = finger, self.drive, self.geometry.contact(finger)
@@ -134,20 +186,28 @@ class DerivedQuantities(eqx.Module):
         return jnp.stack([finger.g, finger.b, force.mean, force.peak, force.rms, friction_mean])
 
     def log_value_and_grad(
-        self, theta: Float[np.ndarray, " parameters"], sigma: Float[np.ndarray, " channels"]
+        self, theta: Float[np.ndarray, " parameters"], charges: UnknownCharges
     ) -> tuple[Float[np.ndarray, " derived"], Float[np.ndarray, "derived parameters"]]:
         """Return the logarithms of the quantities of `DERIVED_NAMES`, and their gradients in theta."""
-        return log_derivatives(self, theta, sigma)
+        (light, kept), gradients = self.without_data(), np.zeros((len(DERIVED_NAMES), theta.size))
+        logs, (gradients[:, kept], by_charge) = log_derivatives(
+            light, theta[kept], charges.voltages if self.charge else None
+        )
+        return logs, gradients if by_charge is None else gradients + by_charge @ charges.slopes
 
 
 @jit
-def log_derivatives(derive: DerivedQuantities, theta: Array, sigma: Array) -> tuple[Array, Array]:
-    def logs(theta: Array) -> tuple[Array, Array]:
-        logs = jnp.log(derive(theta, sigma))
+def log_derivatives(
+    derive: DerivedQuantities, theta: Array, charges: Array | None
+) -> tuple[Array, tuple[Array, Array | None]]:
+    """Return the logarithms of the quantities, and their derivatives in theta and in the charges."""
+
+    def logs(theta: Array, charges: Array | None) -> tuple[Array, Array]:
+        logs = jnp.log(derive.evaluate(theta, charges))
         return logs, logs
 
-    gradient, values = jax.jacfwd(logs, has_aux=True)(theta)
-    return values, gradient
+    gradients, values = jax.jacfwd(logs, argnums=(0, 1), has_aux=True)(theta, charges)
+    return values, gradients
 
 
 def draw_derived(
@@ -222,7 +282,9 @@ def derived_from_fit(
     jump_delay = 0.5 * record.time_step if isinstance(likelihood.template, WithSkin) else 0.0
     drive, grid = (drive, _grid(record, choice, jump_delay)) if last is None else last
     steady_state, charge = choice.steady_state and last is None, choice.unknown_charge and last is None
-    return DerivedQuantities(likelihood.without_samples(), drive, *_settings(scene, grid), steady_state, charge)
+    begin = np.asarray(channel.samples.time)[0]
+    fixed = begin, steady_state, charge, channel.channel, channel.drive_gains
+    return DerivedQuantities(likelihood.without_samples(), drive, *_settings(scene, grid), *fixed)
 
 
 def _settings(scene: Scene, grid: tuple[np.ndarray, np.ndarray]) -> tuple[Any, Any, Geometry, Any, Any]:
@@ -272,7 +334,9 @@ def derived_from_scene(likelihood: Likelihood, scene: Scene) -> DerivedQuantitie
             f" {scene.drive.waveform} of the scene is not one; choose another waveform or steady_state in [drive]"
         )
     settings = _settings(scene, _period_grid(drive, 0.0))
-    return DerivedQuantities(likelihood, as_arrays(drive), *settings, steady_state=True, charge=False)
+    channel = likelihood.channels[0]
+    fixed = np.asarray(0.0), True, False, channel.channel, channel.drive_gains
+    return DerivedQuantities(likelihood, as_arrays(drive), *settings, *fixed)
 
 
 def _grid(record: Record, choice: DriveModel, jump_delay: float) -> tuple[np.ndarray, np.ndarray]:

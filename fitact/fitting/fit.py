@@ -146,9 +146,10 @@ def _assemble_fit(
         derive = derived.derived_from_scene(likelihood, first.scene)
     else:
         derive = derived.derived_from_fit(likelihood, first.record, first.choice, first.scene, float(optimum.b))
-    log_derived = derive.log_value_and_grad(theta, sigma)
+    charges = solution.unknown_charges()
+    log_derived = derive.log_value_and_grad(theta, charges)
     geometry = UncertainGeometry.from_scene(first.scene, derive.geometry)
-    laplace = Laplace(theta, root, sigma, likelihood, derive, log_derived, geometry)
+    laplace = Laplace(theta, root, sigma, likelihood, derive, charges, log_derived, geometry)
     traces = tuple(
         ChannelFit.from_optimum(likelihood, i, theta, float(sigma[i]), optimum, source, certified.reasons[i])
         for i, source in enumerate(problem.sources)

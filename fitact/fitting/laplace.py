@@ -21,6 +21,7 @@ class Laplace:
     sigmas: Float[np.ndarray, " channels"]  # standard deviation of each channel's noise
     likelihood: Likelihood  # the model that was fitted
     derive: derived.DerivedQuantities  # the derived quantities as functions of theta
+    charges: derived.UnknownCharges  # those of `derive`, at the optimum
     # logarithms of the derived quantities at the optimum, and their gradients in theta
     log_derived: tuple[Float[np.ndarray, " derived"], Float[np.ndarray, "derived parameters"]]
     geometry: UncertainGeometry  # what force and friction rest on beside the circuit

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from fitact.compiled import jit
 from fitact.experiment.fisher import covariance_factor
+from fitact.fitting.derived import UnknownCharges
 from fitact.fitting.minimum import minimise, result_name
 from fitact.fitting.score_test import explained_squares
 from fitact.fitting.timing import clock_r_squared, free_timing
@@ -45,6 +46,7 @@ class LeastSquaresResult:
     steps: int  # total number of trial steps
     prior: tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows parameters"]]  # its residuals and their Jacobian
     jacobian: tuple[Float[np.ndarray, "rows parameters"], ...]  # Jacobian of the whitened residuals
+    nuisances: tuple[Float[np.ndarray, " columns"], ...]  # linear nuisances, in prior standard deviations
     # under Student's t, all of these are reweighted
     residuals: tuple[Float[np.ndarray, " rows"], ...]
     shapes: tuple[Float[np.ndarray, "columns rows"], ...]  # regressors of the linear nuisances
@@ -55,6 +57,11 @@ class LeastSquaresResult:
         """Return a factor of the covariance of theta in the Laplace approximation."""
         rows = np.concatenate([*self.jacobian, self.likelihood.calibration_jacobian])
         return covariance_factor(rows, self.likelihood.prior_factor)
+
+    def unknown_charges(self) -> UnknownCharges:
+        """Return the unknown charges at the first sample of the first channel."""
+        first = len(self.jacobian[0]) - len(self.nuisances[0])  # the rows of the nuisances follow those of the data
+        return UnknownCharges.from_nuisances(self.likelihood, self.theta, self.nuisances[0], self.jacobian[0][first:])
 
 
 class _Round(NamedTuple):
@@ -67,6 +74,7 @@ class _Round(NamedTuple):
     steps: Array
     prior: tuple[Array, Array]
     jacobian: tuple[Array, ...]
+    nuisances: tuple[Array, ...]
     residuals: tuple[Array, ...]
     shapes: tuple[Array, ...]
     slope: tuple[Array, ...]
@@ -103,12 +111,12 @@ def _solve_round(likelihood: Likelihood, start: Array, sigma: Array, damping: Ar
     parts = []
     for (channel, inputs), s in zip(likelihood.channels_and_inputs(theta), sigma, strict=True):
         remainder, shapes = channel.residuals_and_shapes(inputs)
-        residuals = channel.fit_rows(remainder, shapes, s)[0]
+        residuals, beta, _ = channel.fit_rows(remainder, shapes, s)
         factor = jnp.sqrt(student_weight(residuals / s)) if channel.is_student else 1.0
         signal, slope = channel.whitened_observed() - remainder, channel.whitened_delay_derivative(inputs)
         sigma_new = _noise(channel, residuals, fraction) if channel.expansion is None else channel.expansion.sigma
-        parts.append((residuals, sigma_new, *(factor * x for x in (residuals, shapes, slope, signal))))
-    unweighted, noise, *weighted = zip(*parts, strict=True)
+        parts.append((residuals, sigma_new, beta, *(factor * x for x in (residuals, shapes, slope, signal))))
+    unweighted, noise, nuisances, *weighted = zip(*parts, strict=True)
     if any(channel.is_student for channel in likelihood.channels):
         jacobians = _information_jacobian(likelihood, theta, sigma, unweighted)
     else:
@@ -118,7 +126,8 @@ def _solve_round(likelihood: Likelihood, start: Array, sigma: Array, damping: Ar
     log_density = -minimum.cost - counts @ jnp.log(sigma)
     off_prior = likelihood.prior_residuals(theta)
     prior = off_prior, minimum.jacobian[len(minimum.jacobian) - off_prior.size :]
-    return _Round(theta, jnp.stack(noise), log_density, minimum.result, minimum.steps, prior, jacobians, *weighted)
+    end = theta, jnp.stack(noise), log_density, minimum.result, minimum.steps, prior, jacobians, nuisances
+    return _Round(*end, *weighted)
 
 
 def _information_jacobian(

@@ -226,7 +226,7 @@ class Fit(Display):
             laplace = dataclasses.replace(
                 self.laplace,
                 derive=derive,
-                log_derived=derive.log_value_and_grad(self.theta, self.laplace.sigmas),
+                log_derived=derive.log_value_and_grad(self.theta, self.laplace.charges),
                 geometry=dataclasses.replace(self.laplace.geometry, geometry=geometry),
             )
             i = derived.DERIVED_NAMES.index("force_mean")

@@ -161,7 +161,7 @@ class Likelihood(eqx.Module):
 
     def evaluate_circuit(self, theta: Float[np.ndarray, " circuit_parameters"]) -> CircuitValues:
         """Return the circuit at theta, outside compiled functions."""
-        bare, kept = self._bare()
+        bare, kept = self.for_circuit()
         return _evaluate_circuit(bare, theta[kept])
 
     def evaluate_g_and_b(
@@ -182,15 +182,15 @@ class Likelihood(eqx.Module):
         return np.stack([tau.min(axis=1), tau.max(axis=1)])
 
     def _evaluate_divider(self, points: np.ndarray) -> Float[np.ndarray, "quantities n"]:
-        bare, kept = self._bare()
+        bare, kept = self.for_circuit()
         return BatchEvaluator(_divider, bare, len(kept), batch=256, fast=False)(points[:, kept]).T
 
-    def _bare(self) -> tuple["Likelihood", list[int]]:
+    def for_circuit(self, *others: str) -> tuple["Likelihood", list[int]]:
         """Return the likelihood without all that the circuit does not depend on, and its coordinates.
 
-        One program then serves all likelihoods of a circuit.
+        One program then serves all likelihoods of a circuit. `others` are names of parameters to keep, too.
         """
-        known = circuit_parameters(self.template) | probe_parameters(self.template)
+        known = {*circuit_parameters(self.template), *probe_parameters(self.template), *others}
         kept = [i for i, name in enumerate(self.prior.names) if name in known]
         names = tuple(self.prior.names[i] for i in kept)
         return Likelihood((), self.template, Prior(names, ()), (), self.tied), kept
