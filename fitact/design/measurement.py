@@ -127,9 +127,9 @@ def design_measurement(scene: Scene, records: Record | Sequence[Record] = ()) ->
     """Rank changes of a scene's measurement by the expected uncertainty of the mean force.
 
     The force is always the one of the scene's circuit and drive; the changes apply to the measurement only. Continuous
-    settings are optimized. Uncertainties come from the Laplace approximation, with no unknown offset, drift, delay or
-    initial charge. The drive is exact unless the scene states the noise of V; with this noise, V is what a fit knows of
-    the drive.
+    settings are optimized. Uncertainties come from the Laplace approximation, with no unknown offset, drift or initial
+    charge. The drive is exact unless the scene states the noise of V; with this noise, V is what a fit knows of the
+    drive, and each channel has an unknown delay against it.
 
     Args:
         scene: measurement as it stands.
@@ -145,8 +145,8 @@ def design_measurement(scene: Scene, records: Record | Sequence[Record] = ()) ->
         fitted = fit(records, scene)
         experiment = fitted.experiment
         assert experiment is not None  # which only spectra have not
-        free = [fitted.names.index(name) for name in experiment.free]
-        gradient = fitted.laplace.log_gradient("force_mean")[free]
+        gradient = fitted.identifiability.force_gradient
+        assert gradient is not None
         # the smallest difference between a record's values is the LSB of its ADC, or less
         steps = {name: float(np.diff(np.unique(records[0][name])).min()) for name in experiment.channels}
         judgement = fitted.trusted, (*([] if fitted.trusted else [fitted.message]), *fitted.warnings)
@@ -186,7 +186,7 @@ def experiment_from_scene(scene: Scene) -> Experiment:
         raise InputError(f"scene: [measurement] noise_{silent[0]} is 0, so the data would be exact; state the noise")
     if not prior.names:
         raise InputError("scene: [prior] frees no parameter, so there is nothing to estimate; give a parameter a prior")
-    circuit = count_harmonics(scene.make_circuit(values), scene.drive.lowest_frequency)
+    circuit, time = count_harmonics(scene.make_circuit(values), scene.drive.lowest_frequency), sample_times(scene)
     counted = {*circuit_parameters(circuit), STRAY}
     prior = prior.drop_marginals(*(name for name in prior.names if name not in counted))
     anonymous = {"gain": measured.gain_relative_sd, "gain_I": measured.gain_I_relative_sd}
@@ -198,7 +198,7 @@ def experiment_from_scene(scene: Scene) -> Experiment:
         free=prior.names,
         prior_factor=np.linalg.cholesky(prior.covariance),
         drive=scene.make_drive(),
-        time=sample_times(scene),
+        time=time,
         channels=measured.channels,
         noise=noise,
         steady_state=scene.drive.steady_state,
@@ -207,6 +207,7 @@ def experiment_from_scene(scene: Scene) -> Experiment:
         stray_capacitance=scene.stray_capacitance(),
         new_stray_sd=_stray_sd(scene),
         new_gain_sd={c: scene.gain_u(c) or typical_gain_u(c) for c in ("Vsc", "I") if scene.instrument.is_stated},
+        delay_sd={name: scene.delay_sd(name, float(np.median(np.diff(time)))) for name in ("Vsc", "I")},
     )
 
 

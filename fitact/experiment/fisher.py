@@ -1,7 +1,7 @@
 """Expected uncertainties of parameters and force from an experiment, before or after it is done.
 
 They come from the Fisher information of the channels and the prior, in the same Laplace approximation as a fit. No
-offset, drift, delay or initial charge is taken to be unknown.
+offset or drift is taken to be unknown, and delays and the initial charge are only beside a recorded drive.
 
 A recorded drive has noise, too. A fit that knows the drive from its record alone then has the residuals e = x - h V
 with the covariance diag(s^2) + s_V^2 h h^H at each frequency, where h are the channels' gains over V (errors in
@@ -51,6 +51,11 @@ class Experiment:
     # relative sd of the gain that a channel would have if it was also recorded; a channel without one is exact
     new_gain_sd: Mapping[str, float] = dataclasses.field(default_factory=dict)
     new_stray_sd: float = 0.0  # sd of log(stray_capacitance) that I would add if it was also recorded
+    # sd of the unknown delay of each channel against a V with noise, s; a channel without one is not late
+    delay_sd: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    # steps of V at the first sample that would leave its unknown charge, one for each time constant, V; the charge is
+    # known without them, and beside a V without noise
+    initial_steps: tuple[float, ...] = ()
 
 
 def force_gradient(experiment: Experiment) -> Float[np.ndarray, " circuit_parameters"]:
@@ -71,7 +76,7 @@ def jacobian(experiment: Experiment) -> Float[np.ndarray, "rows parameters"]:
         sampling, model = _sampling(experiment), _Model.from_experiment(experiment)
         signals = _derivatives(model, sampling, slice(-1))
         if has_noise:
-            return _whitened_derivatives(experiment, model, sampling, [slope for _, slope in signals])
+            return _whitened_derivatives(experiment, model, sampling, signals)
     blocks = []
     for channel, (_, slope) in zip(experiment.channels, signals, strict=True):
         weight = sampling.off_edge_weight if _follows_slope(experiment, channel) else sampling.sample_weight
@@ -92,7 +97,6 @@ def _represent_by_uniform_samples(e: Experiment, max_samples: int = 4096) -> Exp
     time, drive = np.asarray(e.time, dtype=float), e.drive
     step, period = float(np.median(np.diff(time))), getattr(drive, "period", None)
     if isinstance(drive, Sampled):
-        time = time[: time.size if period is not None else 2 * max_samples]  # whose beginning represents a long record
         drive = _remove_noise(drive, float(time[-1]), e.noise["V"])
     if e.steady_state and period is not None:
         length, count = float(period), max(round(float(period) / step), 8)
@@ -100,6 +104,8 @@ def _represent_by_uniform_samples(e: Experiment, max_samples: int = 4096) -> Exp
         length, count = float(time[-1] - time[0]) + step, time.size
     count = min(count, max_samples)
     grid = time[0] + length / count * np.arange(count)
+    if isinstance(drive, Sampled) and period is None and drive.time.size > 2 * max_samples:
+        drive = Sampled(grid, np.interp(grid, drive.time, drive.samples))
     return dataclasses.replace(e, drive=drive, time=grid, records=e.records * np.size(e.time) / count)
 
 
@@ -113,7 +119,10 @@ def _remove_noise(drive: Sampled, end: float, noise: float, min_ratio: float = 1
     # half a step for rounding; samples that fill an array up follow
     count = 1 + int(np.searchsorted(time, last - 0.5 * (time[1] - time[0])))
     time, samples = time[:count], samples[:count]
-    trend = np.zeros_like(samples) if drive.period is not None else np.linspace(samples[0], samples[-1], count)
+    step = samples[-1] - samples[-2]
+    # of a drive that does not end where it began; one sample before that, it has run through whole periods
+    rise = samples[-1] - samples[0] if abs(samples[-1] + step - samples[0]) > abs(step) + 5.0 * noise else 0.0
+    trend = np.linspace(0.0, 0.0 if drive.period is not None else rise, count)
     lines = np.fft.rfft(samples - trend)
     lines[np.abs(lines) ** 2 < min_ratio * count * noise**2] = 0.0
     clean = np.fft.irfft(lines, count) + trend
@@ -121,11 +130,12 @@ def _remove_noise(drive: Sampled, end: float, noise: float, min_ratio: float = 1
 
 
 def _whitened_derivatives(
-    e: Experiment, model: "_Model", sampling: "_Sampling", slopes: list[np.ndarray]
+    e: Experiment, model: "_Model", sampling: "_Sampling", signals: list[tuple[np.ndarray, np.ndarray]]
 ) -> Float[np.ndarray, "rows parameters"]:
     """Return the derivatives of uniform samples in units of the noise of channels and V, by frequency.
 
-    Samples that are not used have an error of their own each, whose direction is removed.
+    Unknown delays and charges count as noise. Samples that are not used have an error of their own each, whose
+    direction is removed. `signals` holds the values of each channel, and their derivatives.
     """
     count, step = e.time.size, float(e.time[1] - e.time[0])
     omega = 2.0 * np.pi * np.fft.rfftfreq(count, step)
@@ -141,12 +151,18 @@ def _whitened_derivatives(
         white = np.linalg.solve(root, lines).reshape(-1, signals.shape[2])
         return np.concatenate([white.real, white.imag])
 
-    rows = whiten(np.stack([slope[:count] for slope in slopes], axis=1))
+    values, slopes = (np.stack([each[:count] for each in pair], axis=1) for pair in zip(*signals, strict=True))
+    transient, decays = _unknown_charges(e, model, values)
+    delayed = np.eye(scale.size) * [e.delay_sd.get(channel, 0.0) for channel in e.channels]
+    delayed = delayed * np.gradient(values, step, axis=0)[:, :, None]
+    rows = whiten(np.concatenate([slopes + transient, delayed, decays], axis=2))
+    beside_edge = sampling.off_edge_weight[:count] == 0.0
+    beside_edge[[0, 1, -2, -1]] |= not e.steady_state  # before and after which the drive is at rest
     unused = [
         (sample, number)
         for number, channel in enumerate(e.channels)
-        for sample in np.flatnonzero(sampling.off_edge_weight[:count] == 0.0)
         if _follows_slope(e, channel)
+        for sample in np.flatnonzero(beside_edge)
     ]
     if unused:
         impulses = np.zeros((count, scale.size, len(unused)))
@@ -154,7 +170,31 @@ def _whitened_derivatives(
             impulses[sample, number, column] = 1.0 / scale[number]
         basis = np.linalg.qr(whiten(impulses))[0]
         rows -= basis @ (basis.T @ rows)
-    return sampling.sample_weight[0] * rows
+    rows, others = np.split(sampling.sample_weight[0] * rows, [len(e.free)], axis=1)
+    directions, sizes, _ = np.linalg.svd(others, full_matrices=False)
+    return rows - directions * (1.0 - 1.0 / np.hypot(1.0, sizes)) @ (directions.T @ rows)
+
+
+def _unknown_charges(
+    e: Experiment, model: "_Model", values: Float[np.ndarray, "samples channels"]
+) -> tuple[Float[np.ndarray, "samples channels parameters"], Float[np.ndarray, "samples channels charges"]]:
+    """Return the derivatives of what initial charges add to uniform samples, and the effects of an unknown charge.
+
+    Each channel has a charge of its own for each time constant, whose standard deviation is ten times the range of the
+    channel, as in a fit.
+    """
+    size, n = values.shape
+    if not e.initial_steps or not has_time_constants(e.circuit):
+        return np.zeros((size, n, len(e.free))), np.zeros((size, n, 0))
+    terms, slopes = (each[:n] for each in _term_derivatives(model))
+    tau = np.exp(np.array([each.log_tau for each in terms]))
+    since = (e.time - e.time[0])[:, None, None] / tau
+    decay = np.exp(-since)
+    steps = np.pad(e.initial_steps, (0, tau.shape[1]))[: tau.shape[1]]
+    changes = since * decay * steps * np.array([each.weight for each in terms])
+    transient = np.einsum("snk,nkp->snp", changes, np.array([each.log_tau for each in slopes]))
+    unknown = 10.0 * np.ptp(values, axis=0)[:, None, None] * np.eye(n)[:, :, None] * decay[:, :, None, :]
+    return transient, unknown.reshape(size, n, -1)
 
 
 def signal_spans(experiment: Experiment) -> dict[Channel, float]:

@@ -183,7 +183,7 @@ def _assemble_fit(
         notes=(*calibrated.notes, *dict.fromkeys(said.notes)),
         traces=traces,
         compression_error=certified.error,
-        experiment=problem.experiment(likelihood, optimum.circuit, theta, sigma),
+        experiment=problem.experiment(likelihood, optimum, theta, sigma, charges.voltages),
         error_sources=list_error_sources(likelihood, problem.coordinates, first.scene),
         noise_information=noise_information(likelihood, solution),
         gain_shifts=gain_shifts(likelihood, solution, root),

@@ -47,7 +47,7 @@ class Identifiability:
     channels: tuple[str, ...]  # channels recorded beside V
     # the measurement of the data; None with a spectrum
     experiment: Experiment | None = dataclasses.field(default=None, repr=False, compare=False)
-    # gradient of the logarithm of the mean force in the free parameters of `experiment`
+    # gradient of the logarithm of the mean force in the free parameters of `experiment`, which others follow
     force_gradient: Float[np.ndarray, " free"] | None = dataclasses.field(default=None, repr=False, compare=False)
     # standard uncertainty of the log mean force from what no suggested measurement changes, now and after one, and the
     # names of the sources
@@ -75,7 +75,7 @@ class Identifiability:
         with double_precision():
             stray = experiment.stray_capacitance
             structure = blind_directions(experiment.circuit, experiment.free, experiment.channels, stray)
-            options = suggest_measurements(experiment, self.force_gradient)
+            options = suggest_measurements(experiment, self.force_gradient, self.force_sd)
         figures = [f"{show(option.force_sd, after)} with {option.text}" for option in options]
         expected = f"{force}. Expected after one change: {', '.join(figures)}."
         hints: list[str] = []
@@ -168,8 +168,18 @@ def assess_identifiability(
     free = [name for name in experiment.free if name not in (*gain_names(experiment.channels), STRAY)]
     factors = covariance_factor, prior_factor
     judgement = assess_parameters(names, *factors, force_gradient, free, experiment.channels, unchanged)
-    rows = [list(names).index(name) for name in experiment.free]
-    return dataclasses.replace(judgement, experiment=experiment, force_gradient=force_gradient[rows])
+    root = covariance_factor[[list(names).index(name) for name in experiment.free]]
+    gradient = _regress(covariance_factor.T @ force_gradient, root)
+    return dataclasses.replace(judgement, experiment=experiment, force_gradient=gradient)
+
+
+def _regress(deviate: Float[np.ndarray, " n"], roots: Float[np.ndarray, "parameters n"]) -> np.ndarray:
+    """Return how a quantity follows some of the parameters when all others take their expected values.
+
+    Quantity and parameters are given by factors of their joint covariance.
+    """
+    sd = np.linalg.norm(roots, axis=1)
+    return np.linalg.lstsq((roots / sd[:, None]).T, deviate, rcond=None)[0] / sd
 
 
 def assess_parameters(

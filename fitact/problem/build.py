@@ -21,7 +21,7 @@ from fitact.instrument.effects import INPUT_RANGE
 from fitact.likelihood import certificate
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.compression import HUM_FREQUENCIES
-from fitact.likelihood.likelihood import Likelihood
+from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import Autoregression, estimate_quiet_noise, require_uniform
 from fitact.likelihood.observable import (
     CHARGES,
@@ -46,7 +46,14 @@ from fitact.problem.current import (
     respond_to,
     select_samples,
 )
-from fitact.problem.drive_choice import DriveModel, choose_drive, frequency_error, has_ideal_edges, has_unresolved_edge
+from fitact.problem.drive_choice import (
+    DriveModel,
+    choose_drive,
+    frequency_error,
+    has_ideal_edges,
+    has_unresolved_edge,
+    whole_periods,
+)
 from fitact.problem.friction import make_friction_channel
 from fitact.problem.instrument_errors import (
     ErrorCoordinate,
@@ -103,10 +110,16 @@ class Problem(NamedTuple):
         return self._replace(likelihood=self.likelihood.replace_channel(channel, remaining))
 
     def experiment(
-        self, likelihood: Likelihood, circuit: Circuit, theta: np.ndarray, sigma: np.ndarray
+        self,
+        likelihood: Likelihood,
+        optimum: CircuitValues,
+        theta: np.ndarray,
+        sigma: np.ndarray,
+        charges: Float[np.ndarray, " charges"],
     ) -> Experiment | None:
-        """Return the measurement at theta, where the circuit is `circuit`, as an experiment.
+        """Return the measurement at theta, where the circuit is `optimum`, as an experiment.
 
+        `charges` are what unknown charges add to the first channel at its first sample, without its gain (V, A).
         Several records are repetitions of the first. None with a spectrum, whose information no experiment in time has.
         """
         source, record = self.sources[0], self.sources[0].record
@@ -124,24 +137,53 @@ class Problem(NamedTuple):
         noise = {"Vsc": measurement.noise_Vsc, "I": measurement.noise_I}
         if source.choice.name == "measured":
             noise["V"] = estimate_noise(record["V"])
+        time, drive = record.time, source.choice.drive
+        if isinstance(drive, Sampled) and drive.period is None:
+            part = slice(_represented_samples(record))
+            time, drive = time[part], Sampled(time[part], np.asarray(drive.samples)[part])
+        free_delays = [each for each in electrical if "delay" in each.timing.free]
+        delay_sd = {each.channel: float(each.timing.sd[0] * each.timing.step) for each in free_delays}
         stray = source.scene.stray_capacitance()
         if STRAY in free:
             stray = math.exp(theta[likelihood.prior.names.index(STRAY)])
         return Experiment(
-            circuit=likelihood.finger(circuit),
+            circuit=likelihood.finger(optimum.circuit),
             free=free,
             prior_factor=np.linalg.cholesky((factor @ factor.T)[np.ix_(rows, rows)]),
-            drive=source.choice.drive,
-            time=record.time - source.choice.shift,
+            drive=drive,
+            time=time - source.choice.shift,
             channels=channels,
             noise=noise | dict(zip(channels, map(float, sigma), strict=False)),
             steady_state=source.choice.steady_state,
-            records=float(records),
+            records=records * len(record) / time.size,
             geometry=source.scene.geometry(),
             stray_capacitance=stray,
             ties=likelihood.tied,
             new_gain_sd={name: source.scene.gain_u(name) or typical_gain_u(name) for name in ("Vsc", "I")},
+            delay_sd={name: source.scene.delay_sd(name, record.time_step) for name in ("Vsc", "I")} | delay_sd,
+            initial_steps=_initial_steps(optimum, likelihood.channels[0].channel, charges)
+            if source.choice.unknown_charge
+            else (),
         )
+
+
+def _represented_samples(record: Record, most: int = 8192) -> int:
+    """Return how many of the first samples of a recorded drive stand for all: `most`, in whole periods if it has any.
+
+    What does not repeat would pass for further frequencies of the drive.
+    """
+    count, length = whole_periods(record)
+    if length is None or count <= most:
+        return min(count, most)
+    periods = length * record.frequency()  # type: ignore[operator]  # of a record that repeats
+    return math.ceil(count / periods * max(math.floor(most * periods / count), 1))
+
+
+def _initial_steps(optimum: CircuitValues, channel: str, charges: Float[np.ndarray, " charges"]) -> tuple[float, ...]:
+    """Return the steps of V that would leave the charges that a channel shows; 0 for a charge that it does not show."""
+    weight = np.array(optimum.terms[channel].weight) if channel in optimum.terms else np.zeros(0)
+    is_shown = np.abs(weight) > 1e-9 * np.max(np.abs(weight), initial=0.0)
+    return tuple(np.divide(charges[: weight.size], weight, out=np.zeros_like(weight), where=is_shown).tolist())
 
 
 def build_problem(
@@ -301,8 +343,7 @@ def _build_channel(
             text = "noise_model is that of Vsc; the noise of I with a recorded V is white, and that of V"
             warnings = (*warnings, text)
         colour, noise, model = None, RecordedCurrent.from_record(record).noise_I, "white"
-        # converters take channels in turn, and probes delay them
-        skew_sd = max(1.0, scene.skew_limit("I", record.time_step) / record.time_step)
+        skew_sd = scene.delay_sd("I", record.time_step) / record.time_step
     elif channel == "Vsc":
         skew_sd = _skew_sd(record, scene, choice, template)
     # edges of a shifted drive are known only to within a step, which affects g; samples of I there are excluded
@@ -475,14 +516,12 @@ def _noise(record: Record, channel: str, scene: Scene) -> tuple[Autoregression |
 def _skew_sd(record: Record, scene: Scene, choice: DriveModel, template: Circuit, min_part: float = 0.01) -> float:
     """Return the prior sd of the delay of Vsc against V in time steps; 0 if it is below `min_part` of a step.
 
-    It is one step if V was recorded and nobody stated with what: converters take channels in turn, and probes delay
-    them. Skins that depend on the frequency, which have no table with a delay, get one by the BIC only.
+    Skins that depend on the frequency, which have no table with a delay, get one by the BIC only.
     """
-    stated = scene.instrument.pieces("V") or scene.instrument.pieces("Vsc")
-    if choice.name == "measured" and not stated:
-        return 0.0 if isinstance(template, WithSkin) else 1.0
-    limit = scene.skew_limit("Vsc", record.time_step) / record.time_step
-    return limit / math.sqrt(3.0) if limit > min_part else 0.0
+    if not scene.states_skew("Vsc") and (choice.name != "measured" or isinstance(template, WithSkin)):
+        return 0.0
+    sd = scene.delay_sd("Vsc", record.time_step) / record.time_step
+    return sd if sd > min_part else 0.0
 
 
 def _prior_of_nuisances(

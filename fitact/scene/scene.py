@@ -322,6 +322,21 @@ class Scene(Section, Display):
         pieces = (*self.instrument.pieces("V"), *self.instrument.pieces(channel))
         return max((piece.skew + piece.skew_intervals * time_step for piece in pieces), default=0.0)
 
+    def states_skew(self, channel: str) -> bool:
+        """Return whether pieces of equipment, which have a skew, are stated for V or for a channel."""
+        return bool(self.instrument.pieces("V") or self.instrument.pieces(channel))
+
+    def delay_sd(self, channel: str, time_step: float) -> float:
+        """Return the prior sd (s) of a channel's delay against a recorded V; `time_step` is that of samples.
+
+        It is one time step if nobody stated with what V was recorded, and always for I: converters take channels in
+        turn, and probes delay them.
+        """
+        limit = self.skew_limit(channel, time_step)
+        if channel == "I":
+            return max(time_step, limit)
+        return limit / math.sqrt(3.0) if self.states_skew(channel) else time_step
+
     def without_instrument_errors(self) -> Self:
         """Return the scene with instruments that have no errors, but the load of their input."""
         load = self.find_load()

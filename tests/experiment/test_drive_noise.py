@@ -167,3 +167,35 @@ def test_a_recorded_drive_serves_samples_between_its_own():
         rows = jacobian(dataclasses.replace(bench, drive=drive, time=finer, noise=BENCH.noise | {"V": 1e-3}))
         found.append(rows.T @ rows)
     np.testing.assert_allclose(*map(np.diagonal, found), rtol=0.01)
+
+
+@pytest.mark.parametrize("channels", [("Vsc",), ("I",), ("Vsc", "I")], ids="+".join)
+@pytest.mark.parametrize("late", [1e-7, 1e-5, 1e-3])
+def test_unknown_delays_take_the_phases_of_a_sine(channels, late: float):
+    """A sine has one line, whose information on the circuit and the delays is a sum over the channels' phasors."""
+    amplitude = 150.0
+    given = dataclasses.replace(
+        BENCH,
+        drive=fitact.Sine(2.0 * amplitude, FREQUENCY),
+        channels=channels,
+        prior_factor=np.diag([0.5, 0.5, 0.05]),
+        delay_sd=dict.fromkeys(channels, late),
+    )
+    logs = np.log(list(VALUES.values()))
+
+    def phasors(theta: np.ndarray) -> np.ndarray:
+        found = gains(theta[:3], OMEGA)
+        return np.array([found[name] for name in channels]) * np.exp(-1j * OMEGA * theta[3:])
+
+    center, steps = np.append(logs, np.zeros(len(channels))), np.array([1e-4] * 3 + [1e-7] * len(channels))
+    changes_of = [phasors(center + d) - phasors(center - d) for d in np.diag(steps)]
+    slope = np.transpose(changes_of) / (2.0 * steps)
+    gain = phasors(center)
+    covariance = np.diag([given.noise[name] ** 2 for name in channels]) + 0.5**2 * np.outer(gain, gain.conj())
+    samples = given.records * COUNT
+    information = 0.5 * samples * amplitude**2 * (slope.conj().T @ np.linalg.solve(covariance, slope)).real
+    prior = np.diag([0.5, 0.5, 0.05] + [late] * len(channels))
+    # in units of the prior, since the delays are small numbers
+    expected = prior @ np.linalg.inv(np.eye(len(prior)) + prior @ information @ prior) @ prior
+    # the derivatives in time are differences between neighbouring samples
+    np.testing.assert_allclose(found_sd(given), np.sqrt(np.diag(expected))[:3], rtol=2e-3)

@@ -14,6 +14,7 @@ import data_synth.recipe
 import data_synth.scene
 import fitact
 from data_synth.keys import validate_sections
+from fitact.experiment.experiment import CandidateDesign, evaluate_design
 from fitact.problem.current import hum_likeness
 from fitact.problem.recorded_current import RecordedCurrent, estimate_noise
 from tests.conftest import RECORDS
@@ -156,6 +157,21 @@ def bench_scene(channels: list[str]) -> fitact.Scene:
     content = {"channels": channels, "current_lead": "ground"}
     prior = {"Ci": {"median": 0.9e-9, "relative_sd": 0.5}}
     return fitact.Scene.from_dict({"measurement": content, "drive": {"waveform": "measured"}, "prior": prior})
+
+
+@pytest.mark.parametrize("channels", [["I"], ["Vsc", "I"]], ids="+".join)
+def test_expected_uncertainty_is_that_of_the_fit(channels: list[str]):
+    """A sine has one line, in which unknown delays and charges leave I alone 60 times less than it has without."""
+    sine = {"waveform": "sine", "peak_to_peak": 300.0, "frequency": 70.0}
+    record = simulate_bench(sine, 14, 50e3, {"V": 0.05, "Vsc": 0.05, "I": 20e-9})
+    found = fitact.fit(record, bench_scene(channels))
+    assert found.experiment is not None
+    identifiability = found.identifiability
+    now = evaluate_design(CandidateDesign((found.experiment,)), (), identifiability.force_gradient)
+    # I alone leaves Csc to a factor of three, over which the curvature changes
+    assert list(now.sd.values()) == pytest.approx(found.sd[:3].tolist(), rel=0.2 if channels == ["I"] else 0.03)
+    assert now.force_sd == pytest.approx(identifiability.force_sd, rel=0.2 if channels == ["I"] else 0.03)
+    assert all(option.force_sd < 1.01 * identifiability.force_sd for option in identifiability.remedies)
 
 
 def test_edges_that_set_the_range_of_I_leave_its_plateaus_to_few_steps():
