@@ -35,6 +35,7 @@ from fitact.likelihood import certificate
 from fitact.likelihood.likelihood import CircuitValues
 from fitact.problem.build import Problem, build_problem
 from fitact.problem.drive_choice import DriveModel
+from fitact.problem.experiment import experiment_from_problem
 from fitact.scene.scene import Scene
 
 
@@ -183,7 +184,7 @@ def _assemble_fit(
         notes=(*calibrated.notes, *dict.fromkeys(said.notes)),
         traces=traces,
         compression_error=certified.error,
-        experiment=problem.experiment(likelihood, optimum, theta, sigma, charges.voltages),
+        experiment=experiment_from_problem(problem, likelihood, optimum, theta, sigma, charges.voltages),
         error_sources=list_error_sources(likelihood, problem.coordinates, first.scene),
         noise_information=noise_information(likelihood, solution),
         gain_shifts=gain_shifts(likelihood, solution, root),

@@ -14,14 +14,12 @@ from fitact.data.clipping import clipping_mask, describe_clipping
 from fitact.data.record import Record, rounding_noise_sd
 from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
-from fitact.experiment.blind_directions import STRAY, gain_names
-from fitact.experiment.fisher import Experiment
-from fitact.instrument.classes import typical_gain_u
+from fitact.experiment.blind_directions import STRAY
 from fitact.instrument.effects import INPUT_RANGE
 from fitact.likelihood import certificate
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.compression import HUM_FREQUENCIES
-from fitact.likelihood.likelihood import CircuitValues, Likelihood
+from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import Autoregression, estimate_quiet_noise, require_uniform
 from fitact.likelihood.observable import (
     CHARGES,
@@ -35,7 +33,7 @@ from fitact.likelihood.padded_samples import PaddedSamples
 from fitact.likelihood.smooth_drive import smooth_drive
 from fitact.model.circuit import Channel, Circuit, FinalCircuit, passes_direct_current
 from fitact.model.drive import Sampled
-from fitact.model.skin import WithSkin, circuit_parameters, constant_skin_circuit, limits_current
+from fitact.model.skin import WithSkin, constant_skin_circuit, limits_current
 from fitact.prior.distributions import Distribution, LogNormal
 from fitact.prior.prior import Prior
 from fitact.prior.product import multiply
@@ -52,7 +50,6 @@ from fitact.problem.drive_choice import (
     frequency_error,
     has_ideal_edges,
     has_unresolved_edge,
-    whole_periods,
 )
 from fitact.problem.friction import make_friction_channel
 from fitact.problem.instrument_errors import (
@@ -63,7 +60,7 @@ from fitact.problem.instrument_errors import (
     largest_gain,
 )
 from fitact.problem.limited_current import NoisePath, set_drive
-from fitact.problem.recorded_current import Current, RecordedCurrent, estimate_noise, set_rows
+from fitact.problem.recorded_current import Current, RecordedCurrent, set_rows
 from fitact.problem.runs import long_run_share
 from fitact.problem.skin_model import apply_skin_model, count_harmonics, exclude_jumps, require_skin_response
 from fitact.problem.source import Source
@@ -108,82 +105,6 @@ class Problem(NamedTuple):
         """Return the problem in which samples of a channel do not enter the likelihood."""
         remaining = self.likelihood.channels[channel].exclude_samples(excluded)
         return self._replace(likelihood=self.likelihood.replace_channel(channel, remaining))
-
-    def experiment(
-        self,
-        likelihood: Likelihood,
-        optimum: CircuitValues,
-        theta: np.ndarray,
-        sigma: np.ndarray,
-        charges: Float[np.ndarray, " charges"],
-    ) -> Experiment | None:
-        """Return the measurement at theta, where the circuit is `optimum`, as an experiment.
-
-        `charges` are what unknown charges add to the first channel at its first sample, without its gain (V, A).
-        Several records are repetitions of the first. None with a spectrum, whose information no experiment in time has.
-        """
-        source, record = self.sources[0], self.sources[0].record
-        if isinstance(record, Spectrum) or isinstance(self.sources[-1].record, Spectrum):
-            return None
-        records = len({id(source.record) for source in self.sources})
-        pairs = zip(likelihood.channels, self.sources, strict=True)
-        electrical = [each for each, other in pairs if other.record is record and each.channel != "Ft"]
-        channels = tuple(each.channel for each in electrical)
-        fields = circuit_parameters(likelihood.template)
-        gains = gain_names(channels)
-        free = tuple(name for name in likelihood.prior.names if name in fields or name in gains or name == STRAY)
-        rows = [likelihood.prior.names.index(name) for name in free]
-        factor, measurement = likelihood.prior_factor, source.scene.measurement
-        noise = {"Vsc": measurement.noise_Vsc, "I": measurement.noise_I}
-        if source.choice.name == "measured":
-            noise["V"] = estimate_noise(record["V"])
-        time, drive = record.time, source.choice.drive
-        if isinstance(drive, Sampled) and drive.period is None:
-            part = slice(_represented_samples(record))
-            time, drive = time[part], Sampled(time[part], np.asarray(drive.samples)[part])
-        free_delays = [each for each in electrical if "delay" in each.timing.free]
-        delay_sd = {each.channel: float(each.timing.sd[0] * each.timing.step) for each in free_delays}
-        stray = source.scene.stray_capacitance()
-        if STRAY in free:
-            stray = math.exp(theta[likelihood.prior.names.index(STRAY)])
-        return Experiment(
-            circuit=likelihood.finger(optimum.circuit),
-            free=free,
-            prior_factor=np.linalg.cholesky((factor @ factor.T)[np.ix_(rows, rows)]),
-            drive=drive,
-            time=time - source.choice.shift,
-            channels=channels,
-            noise=noise | dict(zip(channels, map(float, sigma), strict=False)),
-            steady_state=source.choice.steady_state,
-            records=records * len(record) / time.size,
-            geometry=source.scene.geometry(),
-            stray_capacitance=stray,
-            ties=likelihood.tied,
-            new_gain_sd={name: source.scene.gain_u(name) or typical_gain_u(name) for name in ("Vsc", "I")},
-            delay_sd={name: source.scene.delay_sd(name, record.time_step) for name in ("Vsc", "I")} | delay_sd,
-            initial_steps=_initial_steps(optimum, likelihood.channels[0].channel, charges)
-            if source.choice.unknown_charge
-            else (),
-        )
-
-
-def _represented_samples(record: Record, most: int = 8192) -> int:
-    """Return how many of the first samples of a recorded drive stand for all: `most`, in whole periods if it has any.
-
-    What does not repeat would pass for further frequencies of the drive.
-    """
-    count, length = whole_periods(record)
-    if length is None or count <= most:
-        return min(count, most)
-    periods = length * record.frequency()  # type: ignore[operator]  # of a record that repeats
-    return math.ceil(count / periods * max(math.floor(most * periods / count), 1))
-
-
-def _initial_steps(optimum: CircuitValues, channel: str, charges: Float[np.ndarray, " charges"]) -> tuple[float, ...]:
-    """Return the steps of V that would leave the charges that a channel shows; 0 for a charge that it does not show."""
-    weight = np.array(optimum.terms[channel].weight) if channel in optimum.terms else np.zeros(0)
-    is_shown = np.abs(weight) > 1e-9 * np.max(np.abs(weight), initial=0.0)
-    return tuple(np.divide(charges[: weight.size], weight, out=np.zeros_like(weight), where=is_shown).tolist())
 
 
 def build_problem(
