@@ -110,6 +110,7 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
     offset_tolerance: float = 1e-4  # accepted distance from the optimum, in standard errors
     # the same where no step, however short, lowers the cost: a corner of it, e.g. a delay at a sample of the drive
     corner_tolerance: float = 1.0
+    corner_damping: float = 100.0  # above which a step is short, relative to the largest curvature
     max_rejections: int = 4  # rejected steps in a row near the optimum, where rounding dominates the sum of squares
     min_step: float = 1e-10  # relative to the size of the first step
 
@@ -118,6 +119,8 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
         # so near to the optimum, rounding dominates the sum of squares
         there = jnp.square(local.offset) <= jnp.finfo(local.theta.dtype).eps * local.residuals.size
         there |= (local.offset < self.offset_tolerance) & (state.num_steps_since_acceptance > self.max_rejections)
+        is_short = self.descent.damping > self.corner_damping * state.search_state.step_size
+        there |= (local.offset < self.corner_tolerance) & is_short
         return there | state.terminate | (state.search_state.step_size < self.min_step), state.result
 
     def final_result(self, end: _LinearProblem, start: Array, result: Any) -> Int[Array, ""]:

@@ -218,8 +218,7 @@ def _require_same_samples(fits: Mapping[str, Fit]) -> None:
             if differ:
                 raise InputError(
                     f"{first} and {name} do not use the same samples of {trace.channel}: {differ} enter only"
-                    " one of them (near edges if no resistance limits the current; the first of AR(1) noise; samples"
-                    " that bound a clock error); give both the same series resistor or R_H, and noise_model"
+                    " one of them, since a resistance limits its current; give both the same series resistor and R_H"
                 )
 
 

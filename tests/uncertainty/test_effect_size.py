@@ -132,6 +132,7 @@ def test_two_layers_of_skin_lie_inside_the_stated_uncertainty_or_are_a_misfit(ci
         fit = fitact.fit(two_layers(ci, seed), fitact.Scene.from_dict(scene))
         bias, sd = fit.laplace.log_derived[0][:2] - truth, fit.laplace.derived_log_sd[:2]
         assert abs(bias[1]) > 8.0 * sd[1]  # what the noise alone would state
+        assert fit.figures["steps"] < 100  # also at a corner of the sum of squares, where an edge meets a sample
         structure = np.array([fit.effects.structure[name] for name in ("g", "b")])
         assert fit.result == "misfit" or np.all(np.abs(bias) < 2.0 * np.hypot(sd, structure))
 
