@@ -149,13 +149,14 @@ def design_measurement(scene: Scene, records: Record | Sequence[Record] = ()) ->
         assert gradient is not None
         # the smallest difference between a record's values is the LSB of its ADC, or less
         steps = {name: float(np.diff(np.unique(records[0][name])).min()) for name in experiment.channels}
+        trial = CandidateDesign.from_fit(experiment, gradient, fitted.identifiability.force_sd)
         judgement = fitted.trusted, (*([] if fitted.trusted else [fitted.message]), *fitted.warnings)
     else:
         experiment, judgement = experiment_from_scene(scene), (True, ())
+        trial = CandidateDesign((experiment,))
         gradient = force_gradient(experiment)
         # an ordinary oscilloscope has an ADC of 8 bits
         steps = {channel: span / 256 for channel, span in signal_spans(experiment).items()}
-    trial = CandidateDesign((experiment,))
     try:
         now = dataclasses.replace(evaluate_design(trial, (), gradient), name="now", text="as it stands")
     except np.linalg.LinAlgError as error:

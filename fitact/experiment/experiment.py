@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple, TypeAlias
+from typing import Any, ClassVar, NamedTuple, Self, TypeAlias
 
 import numpy as np
 import scipy
@@ -41,6 +41,20 @@ class CandidateDesign:
     names: tuple[str, ...] = ()  # names of the changes
     texts: tuple[str, ...] = ()  # changes in words, with a placeholder for each setting
     effort: float = 0.0  # total effort of the changes (docs/design_measurement.md)
+    factor: float = 1.0  # by which uncertainties exceed those of the Fisher information
+
+    @classmethod
+    def from_fit(cls, experiment: Experiment, gradient: Gradient, force_sd: float) -> Self:
+        """Return the measurement of a fit, whose uncertainties are in proportion to the `force_sd` of the fit.
+
+        A fit may know less than its samples tell: some share the rounding of a converter, or lie beside corners of V.
+        """
+        as_it_is = cls((experiment,))
+        try:
+            now = evaluate_design(as_it_is, (), gradient)
+        except np.linalg.LinAlgError:  # a failed fit may end at a circuit whose current overflows
+            return as_it_is
+        return dataclasses.replace(as_it_is, factor=force_sd / now.force_sd)
 
     def make_experiments(self, values: Sequence[float], *, keep_phase: bool = False) -> tuple[Experiment, ...]:
         """Return the experiments with their settings at `values`.
@@ -103,7 +117,9 @@ def evaluate_design(
     values = [float(f"{value:.3g}") for value in values]
     experiments = design.make_experiments(values)
     free, prior = experiments[0].free, experiments[0].prior_factor
-    root = covariance_factor(_joint_jacobian(experiments), _joint_prior_factor(experiments))[: len(free)]
+    root = (
+        design.factor * covariance_factor(_joint_jacobian(experiments), _joint_prior_factor(experiments))[: len(free)]
+    )
     gradient = np.pad(gradient, (0, len(free) - len(gradient)))  # the force does not depend on an added gain
     sd, prior_sd = np.linalg.norm(root, axis=1), np.linalg.norm(prior, axis=1)
     force_sd = float(np.linalg.norm(gradient @ root))
@@ -161,7 +177,7 @@ def optimise(design: CandidateDesign, gradient: Gradient, starts: int = 3, min_i
 def force_sd(design: CandidateDesign, values: Sequence[float], gradient: Gradient) -> float:
     """Return the standard deviation of the log mean force with the settings at `values`."""
     experiments = design.make_experiments(values, keep_phase=True)
-    root = covariance_factor(_joint_jacobian(experiments), _joint_prior_factor(experiments))
+    root = design.factor * covariance_factor(_joint_jacobian(experiments), _joint_prior_factor(experiments))
     return float(np.linalg.norm(gradient @ root[: gradient.size]))
 
 

@@ -64,32 +64,15 @@ def changes(adc_steps: Mapping[Channel, float] | None = None) -> tuple[Change, .
     )
 
 
-def suggest_measurements(experiment: Experiment, gradient: Gradient, force_sd: float = 0.0) -> tuple[DesignOption, ...]:
-    """Evaluate the changes that a fit suggests, best first, if they can be made and computed.
-
-    The `force_sd` of the fit may be larger than that expected of the experiment, because rows share the rounding of a
-    converter or are not known beside corners of V. Those expected after a change are in the same proportion to it.
-    """
-    as_it_is = CandidateDesign((experiment,))
-
-    def expect(candidate: CandidateDesign) -> DesignOption | None:
-        with contextlib.suppress(np.linalg.LinAlgError):  # a failed fit may end at a circuit whose current overflows
-            return evaluate_design(candidate, candidate.start_values, gradient)
-        return None
-
-    now = expect(as_it_is)
-    factor = force_sd / now.force_sd if now and force_sd else 1.0
-    candidates = (change(as_it_is) for change in changes() if change.name in NEEDS)
-    changed = [expect(each) for each in candidates if each is not None and each.experiments[0] is not experiment]
-    options = [
-        dataclasses.replace(
-            option,
-            force_sd=factor * option.force_sd,
-            sd={name: factor * sd for name, sd in option.sd.items()},
-        )
-        for option in changed
-        if option is not None
-    ]
+def suggest_measurements(as_it_is: CandidateDesign, gradient: Gradient) -> tuple[DesignOption, ...]:
+    """Evaluate the changes that a fit suggests, best first, if they can be made and computed."""
+    options = []
+    for change in changes():
+        candidate = change(as_it_is) if change.name in NEEDS else None
+        if candidate is not None and candidate.experiments[0] is not as_it_is.experiments[0]:
+            # a failed fit may end at a circuit whose current overflows
+            with contextlib.suppress(np.linalg.LinAlgError):
+                options.append(evaluate_design(candidate, candidate.start_values, gradient))
     return tuple(sorted(options, key=lambda option: option.force_sd))
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from fitact.compiled import double_precision
 from fitact.experiment.blind_directions import STRAY, blind_directions, gain_names, name_direction
-from fitact.experiment.experiment import DesignOption
+from fitact.experiment.experiment import CandidateDesign, DesignOption
 from fitact.experiment.fisher import Experiment
 from fitact.experiment.options import NEEDS, suggest_measurements
 from fitact.model.circuit import FINGER_PARAMETERS
@@ -75,7 +75,8 @@ class Identifiability:
         with double_precision():
             stray = experiment.stray_capacitance
             structure = blind_directions(experiment.circuit, experiment.free, experiment.channels, stray)
-            options = suggest_measurements(experiment, self.force_gradient, self.force_sd)
+            present = CandidateDesign.from_fit(experiment, self.force_gradient, self.force_sd)
+            options = suggest_measurements(present, self.force_gradient)
         figures = [f"{show(option.force_sd, after)} with {option.text}" for option in options]
         expected = f"{force}. Expected after one change: {', '.join(figures)}."
         hints: list[str] = []

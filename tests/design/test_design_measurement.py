@@ -231,27 +231,31 @@ def test_no_random_setting_is_better(names: tuple[str, ...]):
 
 
 def test_remedies_are_the_quick_changes_best_first():
-    found = {option.name: option for option in suggest_measurements(NOMINAL, force_gradient(NOMINAL))}
+    found = {
+        option.name: option for option in suggest_measurements(CandidateDesign((NOMINAL,)), force_gradient(NOMINAL))
+    }
     assert list(found) == ["current", "series resistor", "better Ci", "longer record"]
     assert found["current"].text == "the loop current I also recorded (20 nA rms noise)"
     assert found["series resistor"].text == "a known resistor of 100 kΩ in series"
     assert found["better Ci"].force_sd == pytest.approx((2.0 / 0.09 + 4.0 / 0.0025) ** -0.5, rel=1e-4)
     noisier = dataclasses.replace(NOMINAL, noise={"Vsc": 0.1, "I": 40e-9})
     assert "the loop current I also recorded (40 nA rms noise)" in {
-        o.text for o in suggest_measurements(noisier, force_gradient(NOMINAL))
+        o.text for o in suggest_measurements(CandidateDesign((noisier,)), force_gradient(NOMINAL))
     }
 
 
 def test_no_remedy_that_was_taken():
     done = dataclasses.replace(BOTH, circuit=RESISTOR, free=("Rsc", "Csc"), prior_factor=np.diag(PRIOR_SD[:2]))
-    assert [option.name for option in suggest_measurements(done, force_gradient(done))] == ["longer record"]
+    assert [option.name for option in suggest_measurements(CandidateDesign((done,)), force_gradient(done))] == [
+        "longer record"
+    ]
 
 
 def test_remedies_at_a_circuit_whose_current_overflows():
     """A fit that failed may end there; what can be computed is still told."""
     far = dataclasses.replace(NOMINAL, circuit=fitact.FinalCircuit(Rsc=1e-200, Csc=1e-8, Ci=1e-10))
     with np.errstate(all="ignore"):
-        found = [option.name for option in suggest_measurements(far, force_gradient(NOMINAL))]
+        found = [option.name for option in suggest_measurements(CandidateDesign((far,)), force_gradient(NOMINAL))]
     assert "current" not in found
 
 
