@@ -117,9 +117,8 @@ def evaluate_design(
     values = [float(f"{value:.3g}") for value in values]
     experiments = design.make_experiments(values)
     free, prior = experiments[0].free, experiments[0].prior_factor
-    root = (
-        design.factor * covariance_factor(_joint_jacobian(experiments), _joint_prior_factor(experiments))[: len(free)]
-    )
+    root = design.factor * covariance_factor(_joint_jacobian(experiments), _joint_prior_factor(experiments))
+    root = root[: len(free)]
     gradient = np.pad(gradient, (0, len(free) - len(gradient)))  # the force does not depend on an added gain
     sd, prior_sd = np.linalg.norm(root, axis=1), np.linalg.norm(prior, axis=1)
     force_sd = float(np.linalg.norm(gradient @ root))

@@ -329,7 +329,7 @@ class Scene(Section, Display):
     def delay_sd(self, channel: str, time_step: float) -> float:
         """Return the prior sd (s) of a channel's delay against a recorded V; `time_step` is that of samples.
 
-        It is one time step if nobody stated with what V was recorded, and always for I: converters take channels in
+        It is one time step if nobody stated with what V was recorded, and no less for I: converters take channels in
         turn, and probes delay them.
         """
         limit = self.skew_limit(channel, time_step)

@@ -188,8 +188,8 @@ def test_unknown_delays_take_the_phases_of_a_sine(channels, late: float):
         return np.array([found[name] for name in channels]) * np.exp(-1j * OMEGA * theta[3:])
 
     center, steps = np.append(logs, np.zeros(len(channels))), np.array([1e-4] * 3 + [1e-7] * len(channels))
-    changes_of = [phasors(center + d) - phasors(center - d) for d in np.diag(steps)]
-    slope = np.transpose(changes_of) / (2.0 * steps)
+    differences = [phasors(center + d) - phasors(center - d) for d in np.diag(steps)]
+    slope = np.transpose(differences) / (2.0 * steps)
     gain = phasors(center)
     covariance = np.diag([given.noise[name] ** 2 for name in channels]) + 0.5**2 * np.outer(gain, gain.conj())
     samples = given.records * COUNT
