@@ -24,6 +24,8 @@ def solve_problem(
     max_change: float = 0.3,
     max_skew: float = 0.05,
     max_steps: int = 1500,
+    max_late: float = 5.0,
+    max_restarts: int = 1,
 ) -> tuple[LeastSquaresResult, certificate.CertifiedLikelihood, np.ndarray]:
     """Fit, and fit again while effects of instruments for the new optimum would differ by more than `max_change`.
 
@@ -34,7 +36,12 @@ def solve_problem(
     A delay that is known to a tenth of a step may change without end, by up to half a step, if the other parameters
     follow it by less than a twentieth of a standard error. Tables are verified at the end; the samples of channels
     whose table fails are summed from there on.
+
+    A start far from the answer may lead delays astray, by more steps than the rounds lead them back. A fit that has not
+    settled, with a delay of more than `max_late` prior standard deviations, starts again from its circuit, without its
+    delays, at most `max_restarts` times.
     """
+    first = problem
     noise, theta = [source.noise for source in problem.sources], choose_start(problem, start)
     likelihood, best, steps = problem.likelihood, None, 0
     likelihood = estimate_drives(likelihood, theta, problem.sources)
@@ -77,6 +84,10 @@ def solve_problem(
             break
     assert best is not None
     problem, reasons, solved = best
+    if max_restarts and _largest_delay(solved) > max_late:
+        circuit = len(first.likelihood.prior.names)
+        again = first._replace(start=np.append(solved.theta[:circuit], first.start[circuit:]))
+        return solve_problem(again, tolerance, None, max_restarts=max_restarts - 1)
     root = solved.covariance_factor()
     certified, failed = _certify(solved, root, reasons, tolerance)
     while failed:
@@ -86,6 +97,13 @@ def solve_problem(
         root = solved.covariance_factor()
         certified, failed = _certify(solved, root, certified.reasons, tolerance)
     return solved, certified, root
+
+
+def _largest_delay(solved: LeastSquaresResult) -> float:
+    """Return the largest delay or clock error of a solution, in standard deviations of its prior."""
+    likelihood = solved.likelihood
+    off = solved.theta[len(likelihood.prior.names) :] - np.array(likelihood.timing_mean, dtype=float)
+    return float(np.max(np.abs(off / np.array(likelihood.timing_sd, dtype=float)), initial=0.0))
 
 
 def _solve(

@@ -174,6 +174,18 @@ def test_expected_uncertainty_is_that_of_the_fit(channels: list[str]):
     assert all(option.force_sd < 1.01 * identifiability.force_sd for option in identifiability.remedies)
 
 
+def test_delays_that_a_far_start_leads_astray_are_found():
+    """The first rounds took Vsc to be 47 steps late, and ended at a misfit."""
+    sine = {"waveform": "sine", "peak_to_peak": 300.0, "frequency": 70.0}
+    record = simulate_bench(sine, 14, 200e3, {"V": 0.05, "Vsc": 0.05, "I": 20e-9}, 60e3, late=0.3)
+    content = bench_scene(["Vsc", "I"]).model_dump(exclude_unset=True)
+    found = fitact.fit(record, fitact.Scene.from_dict({**content, "grounding": {"R_H": 60e3}}))
+    assert found.trusted
+    assert np.max(np.abs(errors(found))) < 4.0
+    delays = [found.theta[found.names.index(name)] for name in ("delay", "delay_I")]
+    np.testing.assert_allclose(delays, [0.0, 0.3], atol=4.0)
+
+
 def test_edges_that_set_the_range_of_I_leave_its_plateaus_to_few_steps():
     """Rounding of a plateau is one error, and no noise, from which Vsc and I still determine all three to 5 %."""
     square = {"waveform": "trapezoid", "peak_to_peak": 200.0, "frequency": 80.0, "rise_time": 20e-6}
