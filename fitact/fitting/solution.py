@@ -101,9 +101,9 @@ def solve_problem(
 
 def _largest_delay(solved: LeastSquaresResult) -> float:
     """Return the largest delay or clock error of a solution, in standard deviations of its prior."""
-    likelihood = solved.likelihood
-    off = solved.theta[len(likelihood.prior.names) :] - np.array(likelihood.timing_mean, dtype=float)
-    return float(np.max(np.abs(off / np.array(likelihood.timing_sd, dtype=float)), initial=0.0))
+    likelihood, (off_prior, _) = solved.likelihood, solved.prior
+    timing = slice(len(likelihood.prior.names), len(likelihood.names))
+    return float(np.max(np.abs(off_prior[timing]), initial=0.0))
 
 
 def _solve(

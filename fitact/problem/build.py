@@ -44,13 +44,7 @@ from fitact.problem.current import (
     respond_to,
     select_samples,
 )
-from fitact.problem.drive_choice import (
-    DriveModel,
-    choose_drive,
-    frequency_error,
-    has_ideal_edges,
-    has_unresolved_edge,
-)
+from fitact.problem.drive_choice import DriveModel, choose_drive, frequency_error, has_ideal_edges, has_unresolved_edge
 from fitact.problem.friction import make_friction_channel
 from fitact.problem.instrument_errors import (
     ErrorCoordinate,
