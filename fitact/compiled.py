@@ -18,6 +18,7 @@ import os
 import pickle
 import platform
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar
@@ -194,8 +195,25 @@ def _signature(leaves: Sequence[Any]) -> tuple[_Shape | _Static, ...]:
     return tuple(_Shape(leaf.shape, leaf.dtype) if is_array(leaf) else _Static(type(leaf), leaf) for leaf in leaves)
 
 
+_SHARING = threading.Lock()
+
+
+def _find_program(*called: Any) -> _Program:
+    """Return the program of `_make_program`, which the first thread to need it makes while others wait."""
+    with _SHARING:  # or `lru_cache` could return two for the same arguments
+        lock, made = _share_program(*called)
+    with lock:
+        if not made:
+            made.append(_make_program(*called))
+        return made[0]
+
+
 @functools.lru_cache(maxsize=2048)
-def _find_program(
+def _share_program(*_: Any) -> tuple[threading.Lock, list[_Program]]:
+    return threading.Lock(), []
+
+
+def _make_program(
     function: Callable[..., Any], fast: bool, x64: bool, structure: Any, signature: tuple[_Shape | _Static, ...]
 ) -> _Program:
     """Load the program from the disk, or compile it and store it there; `x64` is the current setting of JAX."""

@@ -60,7 +60,7 @@ def _room_for_programs():
     maps = Path("/proc/self/maps")
     if next(_TESTS) % 20 == 0 and maps.exists() and maps.read_bytes().count(b"\n") > _MOST_MAPS:  # reading takes 10 ms
         jax.clear_caches()
-        compiled._find_program.cache_clear()
+        compiled._share_program.cache_clear()
 
 
 hypothesis.settings.register_profile("fitact", max_examples=25, deadline=None, derandomize=True)

@@ -5,6 +5,8 @@ import json
 import os
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import jax
@@ -98,9 +100,9 @@ def test_a_cache_of_the_user_gets_only_what_is_theirs(when, tmp_path):
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("FITACT_CACHE", str(tmp_path))
-    compiled._find_program.cache_clear()
+    compiled._share_program.cache_clear()
     yield tmp_path
-    compiled._find_program.cache_clear()
+    compiled._share_program.cache_clear()
 
 
 def _scaled(circuit: FinalCircuit, scale: np.ndarray, count: int) -> dict[str, jax.Array]:
@@ -127,6 +129,19 @@ def test_a_function_is_traced_within_another(cache):
     np.testing.assert_allclose(slope, 1.35e-9 / (2.0 * 1.35e-9 + 22e-9), rtol=1e-14)
 
 
+def test_threads_that_need_the_same_program_compile_it_once(cache, monkeypatch):
+    names, together = _count_compilations(monkeypatch), threading.Barrier(4)
+
+    def call(_: int) -> np.ndarray:
+        together.wait()
+        return scaled(*ARGUMENTS)["root"]
+
+    with ThreadPoolExecutor(4) as pool:
+        roots = list(pool.map(call, range(4)))
+    assert names == ["_scaled"]
+    assert all(np.array_equal(root, roots[0]) for root in roots)
+
+
 def _count_compilations(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     compile_program, names = compiled._compile, []
 
@@ -150,7 +165,7 @@ def test_a_program_from_the_disk_equals_the_compiled_one_and_a_bad_entry_is_comp
     elif damage == "processor":
         monkeypatch.setattr(compiled, "processor", lambda: "another one")
         compiled._environment.cache_clear()
-    compiled._find_program.cache_clear()
+    compiled._share_program.cache_clear()
     second = terms(circuit, "Vsc")
     monkeypatch.undo()
     compiled._environment.cache_clear()

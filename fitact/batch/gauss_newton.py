@@ -187,7 +187,7 @@ def _r_squared(
     assert isinstance(table, Compression)
     candidates = {name: table.baseline[np.array(places)] for name, places in _SHAPES.items()}
     candidates |= {"delay": channel.whitened_delay_derivative(inputs)[None], "clock": clock[None]}
-    shapes = channel.residuals_and_shapes(inputs)[1] * (channel.linear_sd[np.array(channel.columns, int), None] > 0.0)
+    shapes = channel.residuals_and_shapes(inputs)[1] * (channel.column_sd[:, None] > 0.0)
     around = (0, 0), (0, residuals.size - channel.rows)
     fitted = jnp.concatenate([jacobian.T, jnp.pad(shapes, around)])
     candidates = {name: jnp.pad(rows, around) for name, rows in candidates.items()}

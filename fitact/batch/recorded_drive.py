@@ -267,7 +267,7 @@ def _evaluate_optimum(
     channel, inputs = model.channels[0], model.channel_inputs(theta)
     _, beta, _ = channel.fit_nuisances(inputs, sigma)
     remainder, shapes = functions.residuals_and_shapes(inputs)  # of a record that is 0
-    fitted = (beta * channel.linear_sd[np.array(channel.columns, dtype=int)]) @ shapes - remainder
+    fitted = (beta * channel.column_sd) @ shapes - remainder
     assert isinstance(functions.compression, Compression)
     table = functions.compression  # whose rows are coefficients
     drive = make_response_table(table.center, table.signal, table.decay)

@@ -89,8 +89,9 @@ class ChannelFit:
             of_steps = np.where(samples.likelihood_mask, white, np.nan)[unpadded]
             of_steps = np.append(of_steps[LAG:], np.full(LAG, np.nan))
         residuals, weight = residuals[unpadded], None if samples.equally_weighted else samples.weights[unpadded]
-        names = [channel.qualified_name(channel.observable.linear_names[column]) for column in channel.columns]
-        linear = dict(zip(names, (beta * np.asarray(channel.linear_sd)[list(channel.columns)]).tolist(), strict=True))
+        names = (channel.observable.linear_names[column] for column in channel.columns)
+        sizes = zip(map(channel.qualified_name, names), np.asarray(channel.column_sd), beta, strict=True)
+        linear = {name: float(sd * size) for name, sd, size in sizes if sd > 0.0}
         counted = samples.likelihood_mask[unpadded]
         white = white[unpadded][counted]
         n_fitted = theta.size * white.size / float(likelihood.count) + len(linear)
@@ -224,7 +225,7 @@ def sample_residuals(channel: ChannelLikelihood, inputs: ChannelInputs, sigma: A
         white, beta, _ = channel.fit_rows(whiten(remainder), whiten(shapes), sigma)
     else:
         white, beta, _ = channel.fit_nuisances(inputs, sigma)
-    residuals = remainder - beta @ (channel.linear_sd[np.array(channel.columns, dtype=int), None] * shapes)
+    residuals = remainder - (beta * channel.column_sd) @ shapes
     if channel.noise == "student":
         white = white * jnp.sqrt(student_weight(white / sigma))
     return residuals, white, beta

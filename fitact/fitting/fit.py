@@ -152,7 +152,7 @@ def _assemble_fit(
     geometry = UncertainGeometry.from_scene(first.scene, derive.geometry)
     laplace = Laplace(theta, root, sigma, likelihood, derive, charges, log_derived, geometry)
     traces = tuple(
-        ChannelFit.from_optimum(likelihood, i, theta, float(sigma[i]), optimum, source, certified.reasons[i])
+        ChannelFit.from_optimum(solution.likelihood, i, theta, float(sigma[i]), optimum, source, certified.reasons[i])
         for i, source in enumerate(problem.sources)
     )
     figures = pooled_statistics([channel.figures for channel in traces]) | {"steps": solution.steps}

@@ -36,7 +36,7 @@ def fill_effects(
                 effects = channel.observable.compensation_effect(inputs)
             else:
                 samples = channel.samples
-                residuals, *_ = sample_residuals(channel.drop_unused_columns(), inputs, np.asarray(sigma))
+                residuals, *_ = sample_residuals(channel, inputs, np.asarray(sigma))
                 signal = np.asarray(samples.observed) - residuals - np.asarray(inputs.effects) @ samples.effects
                 effects = _effect_functions(channel, inputs, signal[: samples.size], source)
             likelihood = likelihood.replace_channel(i, channel.replace_samples(effects=effects))

@@ -187,7 +187,7 @@ _fit_nuisances = jit(ChannelLikelihood.fit_nuisances)
 @jit
 def _model(channel: ChannelLikelihood, inputs: ChannelInputs, beta: Array, coordinates: bool = False) -> Array:
     """Return signal and linear nuisances, over samples or (negative) in coordinates of a record that is 0."""
-    sizes = beta * channel.linear_sd[np.array(channel.columns, dtype=int)]
+    sizes = beta * channel.column_sd
     if not coordinates:
         return channel.signal(inputs) + sizes @ channel.shapes(inputs)[np.array(channel.columns, dtype=int)]
     remainder, shapes = channel.residuals_and_shapes(inputs)

@@ -192,6 +192,11 @@ class ChannelLikelihood(eqx.Module):
     def _column_indices(self) -> np.ndarray:
         return np.array(self.columns, dtype=int)
 
+    @property
+    def column_sd(self) -> Float[Array, " columns"]:
+        """Prior standard deviations of the nuisances of the `columns`; 0 for those that are not free."""
+        return self.linear_sd[self._column_indices]
+
     def residuals_and_shapes(self, inputs: ChannelInputs) -> tuple[Float[Array, " rows"], Float[Array, "columns rows"]]:
         """Return channel minus signal, and the shapes of the `columns`, both whitened, over samples or coordinates."""
         return self._evaluate_rows(inputs)[:2]
@@ -299,7 +304,7 @@ class ChannelLikelihood(eqx.Module):
         if self.expansion is not None and isinstance(self.compression, Compression):
             sigma, log_sigma = self.expansion.normal_sigma(sigma)
             remainder = remainder + log_sigma * self.compression.observed_slope
-        A = self.linear_sd[self._column_indices, None] * shapes
+        A = self.column_sd[:, None] * shapes
         # keeps XLA from computing both again at each use
         remainder, A = lax.optimization_barrier((remainder, A))
         precision = jnp.eye(len(A)) + A @ A.T / sigma**2

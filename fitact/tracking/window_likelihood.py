@@ -166,7 +166,7 @@ def _mean_square(
     terms = model.finger(circuit).channel_terms(acting)
     voltage = compression.response(terms)
     _, beta, _ = channel.fit_nuisances(inputs, sigma[0])
-    sizes = dict(zip(channel.columns, beta * channel.linear_sd[np.array(channel.columns, dtype=int)], strict=True))
+    sizes = dict(zip(channel.columns, beta * channel.column_sd, strict=True))
     recorded = circuit.channel_terms(channel.channel)
     decaying = recorded.without_fastest(compression.short).tau
     for index, (ratio, tau) in enumerate(zip(charge_ratios(terms, recorded), decaying, strict=False)):
