@@ -54,7 +54,7 @@ class UnknownCharges(NamedTuple):
         """Return the charges of the first channel from its linear nuisances and their derivatives in theta."""
         channel = likelihood.channels[0]
         log_gain = np.array([dict(channel.gains).get(name, 0.0) for name in likelihood.names])
-        unit = channel.linear_sd[list(channel.columns)] / math.exp(log_gain @ theta)
+        unit = channel.column_sd / math.exp(log_gain @ theta)
         found = np.zeros((len(LINEAR_NUISANCES), 1 + theta.size))
         found[list(channel.columns)] = unit[:, None] * np.column_stack([nuisances, slopes])
         voltages, slopes = np.split(found[FIRST_CHARGE : FIRST_CHARGE + len(CHARGES)], [1], axis=1)

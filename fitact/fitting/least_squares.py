@@ -351,7 +351,7 @@ def _bic_decreases(
     candidates, gains = {}, {}
     for i, channel in enumerate(likelihood.channels):
         shapes, free = solution.shapes[i], channel.linear_sd > 0.0
-        fitted.append(pad_shapes(i, shapes[free[list(channel.columns)]]))
+        fitted.append(pad_shapes(i, shapes[channel.column_sd > 0.0]))
         if "clock" in optional_nuisances[i] and "clock" not in channel.timing.free:
             fraction = clock_r_squared(channel, likelihood.channel_inputs(solution.theta, i), sigma[i])
             gains[i, "clock"] = bic_decrease(fraction, float(channel.count), 1)

@@ -133,7 +133,7 @@ def _residual_sums_of_squares(
     The signals of a `batch` are computed in parallel, but not more than `max_numbers` values at once.
     """
     observed, shapes = _observed_and_shapes(channel, inputs)
-    basis = orthonormalise(shapes[np.asarray(channel.linear_sd)[list(channel.columns)] > 0.0])
+    basis = orthonormalise(shapes[np.asarray(channel.column_sd) > 0.0])
 
     def project_out(values: np.ndarray) -> np.ndarray:
         return values - (values @ basis.T) @ basis

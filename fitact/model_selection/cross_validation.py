@@ -158,6 +158,6 @@ def _linearise(
     parts = zip(full.channels_and_inputs(theta), training.channels_and_inputs(theta), sigma, strict=True)
     for (trace, inputs), (fitted, _), s in parts:
         remainder, unscaled = trace.residuals_and_shapes(inputs)
-        shapes.append(trace.linear_sd[np.array(trace.columns, dtype=int), None] * unscaled)
+        shapes.append(trace.column_sd[:, None] * unscaled)
         remainders.append(remainder - fitted.fit_nuisances(inputs, s)[1] @ shapes[-1])
     return tuple(remainders), jax.jacfwd(residuals)(theta), tuple(shapes)
