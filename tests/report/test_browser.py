@@ -161,6 +161,15 @@ def test_a_chart_that_fails_leaves_its_picture(browser: Browser, page: Path, tmp
     WebDriverWait(browser.driver, 10).until(lambda _: image.is_displayed())
 
 
+def test_a_chart_in_sight_does_not_wait_for_the_observer(browser: Browser, page: Path, tmp_path: Path):
+    """A browser that only takes a picture may never call it."""
+    still = tmp_path / "still.html"
+    still.write_text("<script>IntersectionObserver.prototype.observe = () => {}</script>" + page.read_text())
+    browser.open(still)
+    browser.wait("document.querySelector('figure.chart .plot .main-svg') !== null")
+    assert len(browser.all(".plot .main-svg")) < PLOTS  # the others wait
+
+
 def test_the_prior_comes_and_goes(browser: Browser, page: Path):
     browser.open(page)
     figure, buttons = browser.figure(1)

@@ -73,7 +73,8 @@
     });
   }
 
-  // A chart is drawn when it comes near, so that a page of many opens as soon as one of few.
+  // A chart is drawn when it comes near, so that a page of many opens as soon as one of few. Those that are near at the
+  // start are drawn at once, since a browser that only takes a picture may never call the observer.
   const near = new IntersectionObserver((entries) => {
     for (const { isIntersecting, target } of entries) {
       if (!isIntersecting) continue;
@@ -83,6 +84,7 @@
   }, { rootMargin: "50%" });
   for (const figure of document.querySelectorAll("figure.chart")) {
     figure.classList.add("live");
-    near.observe(figure);
+    if (figure.getBoundingClientRect().top < 1.5 * innerHeight) build(figure);
+    else near.observe(figure);
   }
 })();
