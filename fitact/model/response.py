@@ -61,6 +61,8 @@ def response(
     stops changing, and by time constants above. This is exact for `Dispersive`; `Fractional` documents its error.
     A skin represented by a grid of time constants is computed like any other circuit.
 
+    Outside `jax.enable_x64`, times are rounded, which may move an edge by a millionth of its time.
+
     Raises:
         InputError: the drive has no steady state; `initial` is given for the steady state, or has a wrong number of
             values; a frequency-dependent skin is combined with anything but the steady state of a periodic drive; or
