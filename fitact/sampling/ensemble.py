@@ -61,7 +61,8 @@ def sample(
       than 50 autocorrelation times and split-R-hat over the ensembles is below 1.01, for every coordinate, g, b and
       the mean force, and no walker is stuck.
 
-    Along directions that a bounded prior limits, a tabulated density replaces the Student-t.
+    Where the posterior is curved, the Student-t is bent along its ridge. Along directions that a bounded prior limits,
+    a tabulated density replaces it.
 
     Args:
         fit: result of `fitact.fit`.

@@ -1,10 +1,12 @@
-"""Proposal density of moves and importance sampling: a Student-t around the fit, with tabulated marginals.
+"""Proposal density of moves and importance sampling: a Student-t around the fit, with ridges and tabulated marginals.
 
-With a bounded prior, the posterior is far from normal in directions that the data do not constrain. Along such a
-direction, the density on a line through the optimum is tabulated; the other directions keep the Student-t.
+The posterior may be curved: where it is far from normal along a direction, its ridge is followed, with a normal
+approximation across it at each position. If the density along the ridge is not normal either, as with a bounded prior
+in directions that the data do not constrain, it is tabulated; the other directions keep the Student-t.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Self
@@ -59,15 +61,66 @@ class TabulatedMarginal:
 
 
 @dataclasses.dataclass(frozen=True)
-class Proposal:
-    """Proposal density in the coordinates of the posterior."""
+class Ridge:
+    """Normal approximations of the density at positions along one coordinate, in those coordinates that it bends.
 
-    center: Float[np.ndarray, " n"]  # center of the Student-t
+    They change linearly between the positions, and not beyond the first and the last.
+    """
+
+    along: int
+    bent: list[int]
+    first: float  # position
+    spacing: float  # of the positions
+    centers: Float[np.ndarray, "positions bent"]
+    factors: Float[np.ndarray, "positions bent bent"]  # upper triangular, of the inverse covariances
+
+    def bend(self, z: Float[np.ndarray, "count n"]) -> tuple[np.ndarray, Float[np.ndarray, " count"]]:
+        """Return coordinates for those that are standard normal across the ridge, and log of the change of volume."""
+        (center, factor), bent = self._interpolate(z[:, self.along]), np.array(z)
+        bent[:, self.bent] = center + np.linalg.solve(factor, z[:, self.bent, None])[..., 0]
+        return bent, -_log_determinant(factor)
+
+    def straighten(self, z: Float[np.ndarray, "count n"]) -> tuple[np.ndarray, Float[np.ndarray, " count"]]:
+        """Return the inverse of `bend`, and the same logarithm."""
+        (center, factor), straight = self._interpolate(z[:, self.along]), np.array(z)
+        straight[:, self.bent] = (factor @ (z[:, self.bent] - center)[..., None])[..., 0]
+        return straight, -_log_determinant(factor)
+
+    def is_straight(self, tolerance: float = 0.25) -> bool:
+        """Return whether the approximations are nearly equal."""
+        scatter = np.ptp(self.centers, axis=0), np.abs(self.factors - np.eye(len(self.bent)))
+        return all(np.max(each) < tolerance for each in scatter)
+
+    def scale(self, lengths: Float[np.ndarray, " n"]) -> "Ridge":
+        """Return the ridge in coordinates whose units are longer by factors."""
+        others, along = lengths[self.bent], lengths[self.along]
+        factors = self.factors * others / others[:, None]
+        return Ridge(self.along, self.bent, self.first / along, self.spacing / along, self.centers / others, factors)
+
+    def _interpolate(self, positions: Float[np.ndarray, " count"]) -> tuple[np.ndarray, np.ndarray]:
+        place = np.clip((positions - self.first) / self.spacing, 0.0, len(self.centers) - 1.0)
+        before = np.minimum(place.astype(int), len(self.centers) - 2)
+        share = (place - before)[:, None]
+        center, factor = (
+            (1.0 - share) * flat[before] + share * flat[before + 1]
+            for flat in (self.centers, self.factors.reshape(len(self.factors), -1))
+        )
+        return center, factor.reshape(-1, *self.factors.shape[1:])
+
+
+@dataclasses.dataclass(frozen=True)
+class Proposal:
+    """Proposal density in the coordinates of the posterior.
+
+    A point is `center` and a sum of `axes`, whose factors the `ridges` bend, the last one first.
+    """
+
+    center: Float[np.ndarray, " n"]
     axes: Float[np.ndarray, "n n"]  # principal axes as columns, one standard deviation long
-    # densities along some axes, by index of the axis, in standard deviations from the center
+    ridges: tuple[Ridge, ...] = ()
+    origin: Float[np.ndarray, " n"] | float = 0.0  # center of the Student-t, in coordinates without bends
+    # densities of some coordinates, relative to the origin
     tables: dict[int, TabulatedMarginal] = dataclasses.field(default_factory=dict)
-    # by tabulated axis, how far the other axes bend with the square of the position along it
-    bends: dict[int, Float[np.ndarray, " n"]] = dataclasses.field(default_factory=dict)
     student_share: float = 0.1  # fraction drawn from the Student-t alone, so that the support has no bounds
 
     @classmethod
@@ -78,52 +131,68 @@ class Proposal:
         log_prob: LogProb,
         order: Sequence[int] = (),
     ) -> Self:
-        """Build a proposal from a Laplace approximation; tabulate the axes along which `log_prob` is not normal.
+        """Build a proposal from a Laplace approximation; follow ridges where `log_prob` is not normal along an axis.
 
         With an `order` of the coordinates, each axis changes one of them, and those after it as the covariance says.
         If several priors that the data do not narrow have bounds, those coordinates should come first. Otherwise the
         axes are the principal ones.
         """
         axes = triangular_axes(covariance_factor, order) if len(order) else principal_axes(covariance_factor)
-        center, tables = np.array(point, dtype=float), {}
-        order, center = _enter_support(center, axes, log_prob)
+        order, center = _enter_support(np.array(point, dtype=float), axes, list(order), log_prob)
+        found = cls(center, axes, origin=np.zeros(center.size))
         for i in order:
-            table = _tabulate_axis(center, axes[:, i], log_prob)
+            if is_normal(found._log_density_along(i, log_prob, PROBES)):
+                continue
+            done = [i, *(ridge.along for ridge in found.ridges), *found.tables]
+            found = found._follow_ridge(i, [k for k in order if k not in done], log_prob)
+            table = _tabulate(functools.partial(found._log_density_along, i, log_prob))
             if table is not None:
-                center = center + table.median * axes[:, i]
-                tables[i] = dataclasses.replace(table, low=table.low - table.median)
-        bends = {i: _bend(center, axes, i, [k for k in order if k not in tables], log_prob) for i in tables}
-        return cls(center, axes, tables, bends)
+                origin = found.origin + table.median * np.eye(center.size)[i]
+                tables = found.tables | {i: dataclasses.replace(table, low=table.low - table.median)}
+                found = dataclasses.replace(found, origin=origin, tables=tables)
+        return found
 
     def scale_width(self, factor: float) -> Self:
         """Widen the Student-t by `factor`, and the tables as far as their limits allow."""
         tables = {i: table.scale_width(factor) for i, table in self.tables.items()}
         longer = np.array([1.0 if i in tables else factor for i in range(self.center.size)])
-        return dataclasses.replace(self, axes=self.axes * longer, tables=tables)
+        ridges = tuple(ridge.scale(longer) for ridge in self.ridges)
+        return dataclasses.replace(
+            self, axes=self.axes * longer, origin=self.origin / longer, tables=tables, ridges=ridges
+        )
 
     def draw(self, random: Random, count: int) -> Float[np.ndarray, "count n"]:
         z = draw_student_t(random, count, self.center.size)
         tabulated = random.uniform(size=count) >= self.student_share
         for i, table in self.tables.items():
             z[:, i] = np.where(tabulated, table.draw(random, count), z[:, i])
-        return self.center + (z + self._bend(z)) @ self.axes.T
+        return self._bend(self.origin + z)[0]
 
-    def _bend(self, z: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count n"]:
-        """Return the bend of the axes without tables, which changes no volume."""
-        return sum((np.outer(z[:, i] ** 2, bend) for i, bend in self.bends.items()), np.zeros_like(z))
+    def _bend(self, z: Float[np.ndarray, "count n"]) -> tuple[np.ndarray, Float[np.ndarray, " count"]]:
+        """Return the points of coordinates without bends, and the logarithm of the change of volume."""
+        log_volume = np.zeros(len(z))
+        for ridge in reversed(self.ridges):
+            z, change = ridge.bend(z)
+            log_volume += change
+        return self.center + z @ self.axes.T, log_volume
 
     def log_density(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, " count"]:
         """Return the logarithm of the density, up to a constant."""
         z = np.linalg.solve(self.axes, (points - self.center).T).T
-        z = z - self._bend(z)
+        log_volume = np.zeros(len(z))
+        for ridge in self.ridges:
+            z, change = ridge.straighten(z)
+            log_volume += change
+        z = z - self.origin
         if not self.tables:
-            return student_log_density(z)
+            return student_log_density(z) - log_volume
         others = [i for i in range(self.center.size) if i not in self.tables]
         tabulated = student_log_density(z[:, others])
         for i, table in self.tables.items():
             tabulated = tabulated + table.log_density(z[:, i])
         fraction = self.student_share
-        return np.logaddexp(np.log(1.0 - fraction) + tabulated, np.log(fraction) + student_log_density(z))
+        mixture = np.logaddexp(np.log(1.0 - fraction) + tabulated, np.log(fraction) + student_log_density(z))
+        return mixture - log_volume
 
     def move(
         self, points: Float[np.ndarray, "count n"], random: np.random.RandomState
@@ -131,6 +200,78 @@ class Proposal:
         """Return new points and log q(old) - log q(new), as emcee expects of a proposal function."""
         proposed = self.draw(random, len(points))
         return proposed, self.log_density(points) - self.log_density(proposed)
+
+    def _log_target(self, z: Float[np.ndarray, "count n"], log_prob: LogProb) -> Float[np.ndarray, " count"]:
+        """Return the log-density of coordinates without bends."""
+        points, log_volume = self._bend(z)
+        return log_prob(points) + log_volume
+
+    def _log_density_along(
+        self, axis: int, log_prob: LogProb, positions: Float[np.ndarray, " count"]
+    ) -> Float[np.ndarray, " count"]:
+        """Return it at positions along one of these coordinates from the origin."""
+        return self._log_target(self.origin + positions[:, None] * np.eye(self.center.size)[axis], log_prob)
+
+    def _follow_ridge(
+        self,
+        along: int,
+        others: list[int],
+        log_prob: LogProb,
+        spacing: float = 0.5,
+        farthest: float = 10.0,
+        log_density_range: float = 15.0,
+    ) -> Self:
+        """Return the proposal with the ridge along a coordinate, from the origin both ways until the density is low.
+
+        It bends those of the `others` across which the density is nearly normal. From one position to the next,
+        Newton's method starts where the last three lead.
+        """
+        log_target = functools.partial(self._log_target, log_prob=log_prob)
+
+        def climb(z: np.ndarray, factor: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+            """Return the ridge's point near z, a factor there, and the density, which is NaN if there is no ridge."""
+            for _ in range(6):
+                root = np.linalg.inv(factor)
+                height, gradient, hessian = _differentiate(log_target, z, root.T @ unit[bent])
+                if not np.min(np.linalg.eigvalsh(hessian)) > 0.05:
+                    break
+                change = np.linalg.solve(hessian, gradient)
+                if gradient @ change < 0.1:  # twice the increase that is left
+                    return z, np.linalg.cholesky(factor.T @ hessian @ factor).T, height
+                z = z + root @ change / max(1.0, math.sqrt(gradient @ change) / 10.0) @ unit[bent]
+            return z, factor, math.nan
+
+        start, unit = np.array(self.origin, dtype=float), np.eye(self.center.size)
+        for _ in range(5):
+            _, gradient, hessian = _differentiate(log_target, start, unit[others])
+            curvature = np.diagonal(hessian)
+            usual = (curvature > 0.25) & (curvature < 4.0)
+            start[others] += np.clip(np.where(usual, gradient / np.where(usual, curvature, 1.0), 0.0), -2.0, 2.0)
+        bent = [other for other, use in zip(others, usual, strict=True) if use]
+        if not bent:
+            return self
+        found = dict[int, tuple[np.ndarray, np.ndarray]]()
+        for way in (1, -1):
+            last, factor, highest = [start] * 3, np.eye(len(bent)), -math.inf
+            for number in range(round(farthest / spacing) + 1):
+                ahead = 3.0 * last[-1] - 3.0 * last[-2] + last[-3]
+                ahead[along] = start[along] + way * number * spacing
+                here, factor, height = climb(ahead, factor)
+                last.append(here)
+                highest = max(highest, height)
+                if not height > highest - log_density_range:
+                    break
+                found[way * number] = here[bent], factor
+        if len(found) < 2:
+            return self
+        numbers = sorted(found)
+        centers, factors = (np.array(values) for values in zip(*[found[number] for number in numbers], strict=True))
+        ridge = Ridge(along, bent, start[along] + spacing * numbers[0], spacing, centers, factors)
+        if ridge.is_straight():
+            return dataclasses.replace(self, origin=start)
+        origin = np.array(self.origin)
+        origin[bent] = 0.0
+        return dataclasses.replace(self, ridges=(*self.ridges, ridge), origin=origin)
 
 
 def principal_axes(covariance_factors: Float[np.ndarray, "*any n n"]) -> Float[np.ndarray, "*any n n"]:
@@ -173,71 +314,68 @@ def is_normal(log_densities: Float[np.ndarray, "*shape probes"], tolerance: floa
 
 
 def _enter_support(
-    center: Float[np.ndarray, " n"], axes: Float[np.ndarray, "n n"], log_prob: LogProb, draws: int = 4096
+    center: Float[np.ndarray, " n"],
+    axes: Float[np.ndarray, "n n"],
+    order: list[int],
+    log_prob: LogProb,
+    draws: int = 4096,
 ) -> tuple[list[int], Float[np.ndarray, " n"]]:
     """Return the order in which to tabulate the axes, and the center, or where no axis meets the support, a draw in it.
 
     Where a bound excludes the center, the axis that leads to the highest density comes first. Along another, the
     support may begin only far from the data.
     """
-    order = list(range(center.size))
+    order = order or list(range(center.size))
     if np.isfinite(log_prob(center[None])[0]):
         return order, center
     heights = [float(np.max(log_prob(center + _SEARCH[:, None] * axis))) for axis in axes.T]
     if max(heights) > -math.inf:
-        order.insert(0, order.pop(int(np.argmax(heights))))
+        order.insert(0, order.pop(order.index(int(np.argmax(heights)))))
         return order, center
     points = center + draw_student_t(np.random.default_rng(0), draws, center.size) @ axes.T
     values = log_prob(points)
     return order, points[np.argmax(values)] if np.isfinite(values).any() else center
 
 
-def _bend(
-    center: Float[np.ndarray, " n"],
-    axes: Float[np.ndarray, "n n"],
-    along: int,
-    others: list[int],
-    log_prob: LogProb,
-    position: float = 1.0,
-    step: float = 0.5,
-) -> Float[np.ndarray, " n"]:
-    """Return by how much the most probable values on the axes `others` move with the square of the position on `along`.
+def _log_determinant(factor: Float[np.ndarray, "count m m"]) -> Float[np.ndarray, " count"]:
+    return np.sum(np.log(np.diagonal(factor, axis1=1, axis2=2)), axis=1)
 
-    All are in lengths of the axes, along which the density is nearly normal: the gradient is then the distance. The
-    positions are in the middle and on both sides; a bound within them leaves 0.
+
+def _differentiate(
+    log_density: LogProb, z: Float[np.ndarray, " n"], directions: Float[np.ndarray, "m n"], step: float = 0.5
+) -> tuple[float, Float[np.ndarray, " m"], Float[np.ndarray, "m m"]]:
+    """Return a log-density, its gradient and minus its Hessian along some directions, from differences.
+
+    What lies outside the support leaves a gradient of 0 and the Hessian of a standard normal.
     """
-    if not others:
-        return np.zeros(len(center))
-    ends = np.zeros((3, len(others), 2, len(center)))  # position, other axis, direction
-    ends[..., along] = position * np.array([-1.0, 0.0, 1.0])[:, None, None]
-    for place, other in enumerate(others):
-        ends[:, place, :, other] = step * np.array([-1.0, 1.0])
-    values = log_prob(center + ends.reshape(-1, len(center)) @ axes.T).reshape(ends.shape[:-1])
-    bend = np.zeros(len(center))
-    if np.all(np.isfinite(values)):
-        below, middle, above = np.diff(values, axis=2)[..., 0] / (2.0 * step)
-        bend[others] = (0.5 * (below + above) - middle) / position**2
-    return bend
+    m, unit = len(directions), step * directions
+    pairs = np.triu_indices(m, 1)
+    both = unit[pairs[0]] + unit[pairs[1]]
+    values = log_density(z + np.concatenate([np.zeros((1, z.size)), unit, -unit, both, -both]))
+    middle, after, before, up, down = np.split(values, np.cumsum([1, m, m, len(both)]))
+    with np.errstate(invalid="ignore"):
+        gradient, hessian = (after - before) / (2.0 * step), np.diag((2.0 * middle - after - before) / step**2)
+        second = (after + before)[pairs[0]] + (after + before)[pairs[1]] - up - down - 2.0 * middle
+    hessian[pairs] = hessian[pairs[::-1]] = second / (2.0 * step**2)
+    known = np.isfinite(gradient) & np.isfinite(np.diagonal(hessian))
+    hessian = np.where(np.isfinite(hessian) & known & known[:, None], hessian, np.eye(m))
+    return float(middle[0]), np.where(known, gradient, 0.0), hessian
 
 
-def _tabulate_axis(
-    center: Float[np.ndarray, " n"], axis: Float[np.ndarray, " n"], log_prob: LogProb, log_density_range: float = 25.0
+def _tabulate(
+    log_density: Callable[[np.ndarray], np.ndarray], log_density_range: float = 25.0
 ) -> TabulatedMarginal | None:
-    """Tabulate the density on a line, in lengths of `axis`; return None if it is normal or zero everywhere.
+    """Tabulate a log-density of positions; return None if it is normal or zero everywhere.
 
     The search covers `_SEARCH`. The table ends where the log-density has fallen by `log_density_range` below its
     maximum.
     """
-
-    def line_log_prob(positions: np.ndarray) -> np.ndarray:
-        return log_prob(center + positions[:, None] * axis)
-
-    if is_normal(line_log_prob(PROBES)):
+    if is_normal(log_density(PROBES)):
         return None
-    values, cells = line_log_prob(_SEARCH), _SEARCH.size - 1
+    values, cells = log_density(_SEARCH), _SEARCH.size - 1
     if not np.isfinite(values).any():
         return None
     likely = np.flatnonzero(values > np.max(values) - log_density_range)
     low, high = _SEARCH[max(likely[0] - 1, 0)], _SEARCH[min(likely[-1] + 1, cells)]
     edges = np.linspace(low, high, cells + 1)
-    return TabulatedMarginal.from_log_density(low, (high - low) / cells, line_log_prob(edges))
+    return TabulatedMarginal.from_log_density(low, (high - low) / cells, log_density(edges))

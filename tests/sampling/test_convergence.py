@@ -32,9 +32,17 @@ def log_box_density(points: np.ndarray) -> np.ndarray:
     return np.where(inside, -0.5 * np.sum(points[:, 1:] ** 2, axis=1), -np.inf)
 
 
+def log_banana_density(points: np.ndarray) -> np.ndarray:
+    """Log-density of a standard normal x, and of y and z whose means and widths depend on it, and z's on both."""
+    x, y, z = points.T
+    across = (y - 3.0 * x**2) / np.exp(0.3 * x)
+    return -0.5 * (x**2 + across**2 + (z - 2.0 * x * across + x**3) ** 2) - 0.3 * x
+
+
 PROPOSALS = {
     "student": (Proposal.from_laplace(np.zeros(3), ROOT, log_normal_density), log_normal_density),
     "table": (Proposal.from_laplace(np.array([3.0, 0.0, 0.0]), np.eye(3), log_box_density), log_box_density),
+    "ridge": (Proposal.from_laplace(np.zeros(3), np.eye(3), log_banana_density), log_banana_density),
 }
 
 
@@ -61,13 +69,26 @@ def test_proposal_draws_what_its_density_says(name: str):
     proposal, target = PROPOSALS[name]
     points = proposal.draw(np.random.default_rng(2), 200_000)
     weights = np.exp(target(points) - proposal.log_density(points))
-    constant = (2.0 * np.pi) ** 1.5 * np.sqrt(np.linalg.det(COVARIANCE)) if name == "student" else 3.0 * 2.0 * np.pi
+    normal = (2.0 * np.pi) ** 1.5
+    constant = {"student": normal * np.sqrt(np.linalg.det(COVARIANCE)), "table": 3.0 * 2.0 * np.pi, "ridge": normal}
     error = np.std(weights) / np.sqrt(weights.size)
-    scale = 1.0 if name == "table" else np.prod(np.linalg.svd(ROOT)[1])
-    assert np.mean(weights) * scale == pytest.approx(constant, abs=5.0 * error * scale)
+    scale = np.prod(np.linalg.svd(ROOT)[1]) if name == "student" else 1.0
+    assert np.mean(weights) * scale == pytest.approx(constant[name], abs=5.0 * error * scale)
     assert (name == "table") == bool(proposal.tables)
+    assert (name == "ridge") == bool(proposal.ridges)
     first = weights @ points[:, 0] / weights.sum()
-    assert first == pytest.approx(0.0 if name == "student" else 0.5, abs=0.02)
+    assert first == pytest.approx(0.5 if name == "table" else 0.0, abs=0.02)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.5])
+def test_a_proposal_with_a_ridge_is_close_to_a_curved_density(factor: float):
+    """Without the ridge, 1 % of its draws are effective."""
+    proposal = PROPOSALS["ridge"][0].scale_width(factor)
+    points = proposal.draw(np.random.default_rng(2), 100_000)
+    weights = np.exp(log_banana_density(points) - proposal.log_density(points))
+    assert np.sum(weights) ** 2 / np.sum(weights**2) / weights.size > {1.0: 0.7, 1.5: 0.4}[factor]
+    moments = weights @ np.column_stack([points[:, 1], points[:, 2], points[:, 0] ** 2]) / weights.sum()
+    np.testing.assert_allclose(moments, [3.0, 0.0, 1.0], atol=0.1)
 
 
 def test_table_is_the_density_and_ends_where_it_does():

@@ -13,7 +13,7 @@ from fitact.likelihood import certificate
 from fitact.sampling import ensemble
 from fitact.sampling.convergence import Criteria
 from fitact.sampling.proposal import principal_axes
-from tests.conftest import square_record
+from tests.conftest import RECORDS, square_record
 
 
 def test_log_normal_prior_along_the_blind_direction(finger_posterior: fitact.Posterior, finger_fit: fitact.Fit):
@@ -50,6 +50,16 @@ def test_convergence_is_what_it_says(finger_posterior: fitact.Posterior):
     assert c.ess_min == min(c.ess.values())
     assert c.seconds > 0.0
     assert c.tau_max < 5.0  # the moves that draw from the fit
+    assert c.acceptance > 0.6
+
+
+def test_a_curved_posterior_converges_as_soon_as_others():
+    """I determines a curve: across it, the sd is a hundredth of its bend within two sd along it."""
+    scene = fitact.Scene.load(RECORDS / "bench_multisine.toml")
+    found = fitact.fit(fitact.read(RECORDS / "bench_multisine.csv.gz", scene), scene)
+    c = fitact.sample(found, seed=1, max_steps=500, progress=False).convergence
+    assert c.converged
+    assert c.tau_max < 5.0
     assert c.acceptance > 0.6
 
 
