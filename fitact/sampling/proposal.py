@@ -217,7 +217,7 @@ class Proposal:
         along: int,
         others: list[int],
         log_prob: LogProb,
-        spacing: float = 0.5,
+        spacing: float = 0.25,
         farthest: float = 10.0,
         log_density_range: float = 15.0,
     ) -> Self:
