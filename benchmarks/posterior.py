@@ -15,6 +15,8 @@ a tenth of the steps).
 - `ess_vs_lmfit_N`: against lmfit.emcee on the optimised one;
 - `ess_vs_numpyro_N`: against numpyro's NUTS on the samples, default adaptation;
 - `ess_vs_blackjax_N`: against blackjax's NUTS on the samples, whitened by the Laplace approximation;
+- `curved_vs_stretch`: the least effective draws of any parameter per second, against emcee's stretch moves alone on the
+  same compiled likelihood, for a posterior that lies along a curve: of V and I of a bench, with noise and rounding;
 - `run_vs_lmfit_script`: time of `fitact run` relative to lmfit_script.py (fit, lmfit.emcee to the same effective size
   of the force, corner plot), both as processes; `cold_run_vs_lmfit_script`: the same for a first run, which
   compiles. `whole_vs_good_5000`: effective draws per second of the warm process, from start to end, relative to the
@@ -30,6 +32,7 @@ import time
 import tomllib
 from pathlib import Path
 
+import emcee
 import jax
 import numpy as np
 from likelihood import record
@@ -49,7 +52,11 @@ from peers import (
 from timing import process_seconds, show
 
 import fitact
+from fitact.likelihood.certificate import batched_log_prob
 from fitact.readers.read import write_csv
+from fitact.sampling.ensemble import reject_nonfinite
+
+RECORDS = Path(__file__).parents[1] / "data_synth" / "records"
 
 SCENE = """[drive]
 waveform = "square"
@@ -133,6 +140,27 @@ def long_record(effective: float) -> float:
     return own * step / effective
 
 
+def curved_posterior(steps: int = 20_000, walkers: int = 128) -> float:
+    """Return the ratio of effective draws per second to that of `steps` stretch moves, which last some 50 times tau."""
+    scene = fitact.Scene.load(RECORDS / "bench_multisine.toml")
+    fit = fitact.fit(fitact.read(RECORDS / "bench_multisine.csv.gz", scene), scene)
+    log_prob = reject_nonfinite(batched_log_prob(fit.likelihood, walkers))
+    first = fitact.sample(fit, progress=False)
+    stretch = emcee.EnsembleSampler(walkers, fit.point.size, log_prob, vectorize=True)
+    starts = first.points.reshape(-1, fit.point.size)[:: first.points[..., 0].size // walkers][:walkers]
+    began = time.perf_counter()
+    stretch.run_mcmc(emcee.State(starts, random_state=np.random.RandomState(1).get_state()), steps)
+    took = time.perf_counter() - began
+    tau = float(np.max(stretch.get_autocorr_time(tol=0)))
+    own = []
+    for seed in range(1, ROUNDS + 1):
+        began = time.perf_counter()
+        posterior = fitact.sample(fit, seed=seed, progress=False)
+        own.append(min(posterior.convergence.ess[name] for name in fit.names) / (time.perf_counter() - began))
+    print(f"curved: tau {tau:.0f} and {posterior.convergence.tau_max:.1f}", file=sys.stderr)
+    return statistics.median(own) * took / (steps * walkers / tau)
+
+
 def processes(data: fitact.Record, each: float, quick: bool) -> tuple[dict[str, float], float]:
     """Return times of `fitact run` relative to lmfit's script, and its effective draws per second.
 
@@ -170,6 +198,7 @@ def main() -> None:
         found, each = rates(data, given.quick)
         ratios = {f"ess_vs_{name}_5000": found["fitact"] / rate for name, rate in found.items() if name != "fitact"}
         ratios["ess_vs_good_1000000"] = long_record(each["good"])
+        ratios["curved_vs_stretch"] = curved_posterior()
     print("a second: " + ", ".join(f"{name} {rate:,.0f}" for name, rate in found.items()), file=sys.stderr)
     whole, rate = processes(data, each["lmfit"], given.quick)
     ratios |= whole | {"whole_vs_good_5000": rate / found["good"]}
