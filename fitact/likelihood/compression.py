@@ -6,7 +6,6 @@ coordinates are Chebyshev series. `fitact.likelihood.projection` computes them.
 """
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -259,7 +258,7 @@ class Compression(eqx.Module):
             return signal, voltage, np.asarray(self.steps), float(self.origin)
         low, high = (edge / float(self.time_step) - float(self.origin) for edge in delay)
         middle = round(0.5 * (low + high))
-        ages = min(2 ** math.ceil(math.log2(max(high - middle, middle - low, 1.0))), self.reach)
+        ages = 2 if max(high - middle, middle - low) <= 2.0 else self.reach  # two sizes, so that records share programs
         middle = min(max(middle, ages - self.reach), self.reach - ages)
         first = middle - ages + self.reach
         origin = float(self.origin) + middle

@@ -175,11 +175,14 @@ def chebyshev_polynomials(x: Array, terms: int) -> Float[Array, " terms"]:
 
 
 def count_terms(sizes: Float[np.ndarray, "*tables terms"], precision: ArrayLike) -> int:
-    """Return how many terms keep series of these sizes within `precision`, rounded up as by `round_up_column_count`."""
+    """Return how many terms keep series of these sizes within `precision`, rounded up to a multiple of 8.
+
+    These tables follow the posteriors, of which those of a laboratory differ.
+    """
     tails = np.cumsum(sizes[..., ::-1], axis=-1)[..., ::-1]  # error after omitting a term and all later ones
-    return round_up_column_count(np.max(np.count_nonzero(tails > precision, axis=-1)), sizes.shape[-1])
+    return round_up_column_count(np.max(np.count_nonzero(tails > precision, axis=-1)), sizes.shape[-1], 8)
 
 
-def round_up_column_count(count: float | np.integer, maximum: int) -> int:
-    """Return `count` rounded up to a multiple of 4, at most `maximum`, so that most records share compiled code."""
-    return min(4 * max(1, math.ceil(float(count) / 4)), maximum)
+def round_up_column_count(count: float | np.integer, maximum: int, multiple: int = 4) -> int:
+    """Return `count` rounded up to a multiple, at most `maximum`, so that most records share compiled code."""
+    return min(multiple * max(1, math.ceil(float(count) / multiple)), maximum)
