@@ -15,7 +15,7 @@ a tenth of the steps).
 - `ess_vs_lmfit_N`: against lmfit.emcee on the optimised one;
 - `ess_vs_numpyro_N`: against numpyro's NUTS on the samples, default adaptation;
 - `ess_vs_blackjax_N`: against blackjax's NUTS on the samples, whitened by the Laplace approximation;
-- `curved_vs_stretch`: the least effective draws of any parameter per second, against emcee's stretch moves alone on the
+- `curved_vs_stretch`: effective draws of Csc per second, against emcee's stretch moves alone on the
   same compiled likelihood, for a posterior that lies along a curve: of V and I of a bench, with noise and rounding;
 - `run_vs_lmfit_script`: time of `fitact run` relative to lmfit_script.py (fit, lmfit.emcee to the same effective size
   of the force, corner plot), both as processes; `cold_run_vs_lmfit_script`: the same for a first run, which
@@ -72,21 +72,21 @@ STEPS = 5000  # per round
 class FitactSampler:
     """Sampler that calls `fitact.sample` with another seed each time."""
 
-    def __init__(self, fit: fitact.Fit) -> None:
-        self._fit, self._posteriors = fit, [fitact.sample(fit, progress=False)]
+    def __init__(self, fit: fitact.Fit, quantity: str = "force_mean") -> None:
+        self._fit, self._posteriors, self._quantity = fit, [fitact.sample(fit, progress=False)], quantity
 
     def draw(self) -> float:
-        """Return effective draws of the force per second."""
+        """Return effective draws of the quantity per second."""
         began = time.perf_counter()
         posterior = fitact.sample(self._fit, seed=len(self._posteriors), progress=False)
         took = time.perf_counter() - began
         assert posterior.trusted, posterior.warnings
         self._posteriors.append(posterior)
-        return posterior.convergence.ess["force_mean"] / took
+        return posterior.convergence.ess[self._quantity] / took
 
     @property
     def draws(self) -> np.ndarray:
-        return np.concatenate([posterior.points.reshape(-1, 4) for posterior in self._posteriors])
+        return np.concatenate([posterior.points.reshape(-1, self._fit.point.size) for posterior in self._posteriors])
 
 
 def check(name: str, draws: np.ndarray, effective: float, expected: np.ndarray) -> None:
@@ -144,21 +144,15 @@ def curved_posterior(steps: int = 20_000, walkers: int = 128) -> float:
     """Return the ratio of effective draws per second to that of `steps` stretch moves, which last some 50 times tau."""
     scene = fitact.Scene.load(RECORDS / "bench_multisine.toml")
     fit = fitact.fit(fitact.read(RECORDS / "bench_multisine.csv.gz", scene), scene)
-    log_prob = reject_nonfinite(batched_log_prob(fit.likelihood, walkers))
-    first = fitact.sample(fit, progress=False)
+    ours, log_prob = FitactSampler(fit, "Csc"), reject_nonfinite(batched_log_prob(fit.likelihood, walkers))
     stretch = emcee.EnsembleSampler(walkers, fit.point.size, log_prob, vectorize=True)
-    starts = first.points.reshape(-1, fit.point.size)[:: first.points[..., 0].size // walkers][:walkers]
+    starts = np.random.default_rng(4).choice(ours.draws, walkers, replace=False)
     began = time.perf_counter()
     stretch.run_mcmc(emcee.State(starts, random_state=np.random.RandomState(1).get_state()), steps)
     took = time.perf_counter() - began
-    tau = float(np.max(stretch.get_autocorr_time(tol=0)))
-    own = []
-    for seed in range(1, ROUNDS + 1):
-        began = time.perf_counter()
-        posterior = fitact.sample(fit, seed=seed, progress=False)
-        own.append(min(posterior.convergence.ess[name] for name in fit.names) / (time.perf_counter() - began))
-    print(f"curved: tau {tau:.0f} and {posterior.convergence.tau_max:.1f}", file=sys.stderr)
-    return statistics.median(own) * took / (steps * walkers / tau)
+    tau = float(stretch.get_autocorr_time(tol=0)[fit.names.index("Csc")])
+    print(f"curved: autocorrelation time of the stretch moves {tau:.0f}", file=sys.stderr)
+    return statistics.median(ours.draw() for _ in range(ROUNDS)) * took / (steps * walkers / tau)
 
 
 def processes(data: fitact.Record, each: float, quick: bool) -> tuple[dict[str, float], float]:
