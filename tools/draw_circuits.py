@@ -7,7 +7,6 @@ import functools
 from collections.abc import Callable
 from pathlib import Path
 
-from fitact.scene.diagrams import scene_circuit, scene_wiring
 from fitact.scene.scene import Scene
 
 ROOT = Path(__file__).parents[1]
@@ -28,12 +27,12 @@ _EVERYTHING = Scene.from_dict(
     }
 )
 DRAWINGS: dict[str, Callable[[], str]] = {
-    "circuit": functools.partial(scene_circuit, _EQUAL, is_file=True),
-    "circuit_unequal": functools.partial(scene_circuit, _UNEQUAL, is_file=True),
-    "circuit_natural": functools.partial(scene_circuit, _NATURAL, is_file=True),
-    "circuit_additions": functools.partial(scene_circuit, _EVERYTHING, is_file=True),
-    "wiring": functools.partial(scene_wiring, _EQUAL, is_file=True),
-    "wiring_natural": functools.partial(scene_wiring, _NATURAL, is_file=True),
+    "circuit": functools.partial(_EQUAL.draw_circuit, is_file=True),
+    "circuit_unequal": functools.partial(_UNEQUAL.draw_circuit, is_file=True),
+    "circuit_natural": functools.partial(_NATURAL.draw_circuit, is_file=True),
+    "circuit_additions": functools.partial(_EVERYTHING.draw_circuit, is_file=True),
+    "wiring": functools.partial(_EQUAL.draw_wiring, is_file=True),
+    "wiring_natural": functools.partial(_NATURAL.draw_wiring, is_file=True),
 }
 
 if __name__ == "__main__":

@@ -28,7 +28,6 @@ from fitact.result_text import (
     result_sentences,
     verdict_sentence,
 )
-from fitact.scene.diagrams import scene_circuit, scene_wiring
 from fitact.scene.scene import Scene
 from fitact.summary import format_estimate, format_interval, is_trusted, load
 from fitact.what_now import explain
@@ -49,13 +48,13 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
     try:
         scene = Scene.from_dict(summary["scene"])
         only_impedance = set(summary["model"]["channels"]) == {"impedance"}
-        wirings = () if only_impedance else (scene_wiring(scene),)
+        wirings = () if only_impedance else (scene.draw_wiring(),)
         write_page(
             path,
             "report.html",
             summary=summary,
             charts=make_charts(tree),
-            drawings=(scene_circuit(scene, summary["parameters"]), *wirings),
+            drawings=(scene.draw_circuit(summary["parameters"]), *wirings),
             table=quantity_table(summary),
             panels=_panels(summary["fit"]["traces"]),
             budgets=[budget_table(name, summary) for name in summary["budget"]],

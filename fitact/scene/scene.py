@@ -15,8 +15,10 @@ from typing import Any, Self
 
 import pydantic
 from jax.typing import ArrayLike
+from markupsafe import Markup
 from pydantic import model_validator
 
+from fitact.charts.circuit_diagram import Lead
 from fitact.errors import InputError
 from fitact.instrument.pieces import Piece, find_load
 from fitact.model.circuit import RC, Circuit, DirectGround, FinalCircuit, NaturalGround, Probe
@@ -34,6 +36,7 @@ from fitact.scene.prior_spec import ORDER_KEYS, PriorSpec
 from fitact.scene.section import Section, field_section
 from fitact.scene.threshold_table import resolve_table_path
 from fitact.scene.uncertain_value import UncertainValue
+from fitact.summary import Summary
 from fitact.tables import Display
 
 _DIRECT_GROUND_KEYS = ("R_H", "grounding_Rsc", "grounding_Csc")  # keys of only one kind of grounding
@@ -129,7 +132,34 @@ class Scene(Section, Display):
         return [row for row, after in zip(rows, [*rows[1:], ("",)], strict=True) if len(row) == 2 or len(after) == 2]
 
     def _repr_html_(self) -> str:
-        return super()._repr_html_() + str(diagrams.scene_circuit(self))
+        return super()._repr_html_() + str(self.draw_circuit())
+
+    def draw_circuit(self, values: Mapping[str, Summary] | None = None, *, is_file: bool = False) -> Markup:
+        """Draw the circuit as an SVG element, or as a file; `values`, by name, replace the scene's."""
+        parts, lead = self.describe_parts(values or {}), self.find_current_lead()
+        return diagrams.draw_circuit(parts, self.grounding.connection, lead, is_file=is_file)
+
+    def draw_wiring(self, *, is_file: bool = False) -> Markup:
+        """Draw how the record is measured, as an SVG element, or as a file."""
+        lead = self.find_current_lead()
+        return diagrams.draw_wiring(self.measurement, self.grounding.connection, lead, is_file=is_file)
+
+    def describe_parts(self, values: Mapping[str, Summary]) -> dict[str, str]:
+        """Return each part's value with its unit, by name, of `values` with their standard deviation.
+
+        It is "" where only a prior without a median describes the part.
+        """
+        parts: dict[str, float | None] = {n: spec.median or spec.nominal for n, spec in self.prior.specs().items()}
+        parts |= {name: value for name, value in self.nominal_values().items() if value is not None}
+        return diagrams.describe_parts(parts | self.fixed_values(), self.prior.ties(), self.measurement, values)
+
+    def find_current_lead(self) -> Lead | None:
+        """Return the lead in which I is recorded, or None without I; where it makes no difference, the usual one."""
+        if "I" not in self.measurement.channels:
+            return None
+        if "current_lead" in self.measurement.model_fields_set or self.states_stray_capacitance():
+            return self.measurement.current_lead
+        return "drive" if self.grounding.connection == "natural" else "ground"  # the mains earth would bypass the other
 
     def to_json(self) -> str:
         """Return the stated keys as JSON, in SI units; `from_json` reads it."""

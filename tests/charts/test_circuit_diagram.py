@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from fitact.charts.circuit_diagram import Diagram, lay_out_circuit
-from fitact.scene.diagrams import describe_parts, find_current_lead, scene_circuit, scene_wiring
 from fitact.scene.scene import Scene
 from fitact.summary import summarize_log_normal
 
@@ -45,7 +44,7 @@ SHUNT = 1e-2  # ohm, so small that it changes nothing
 
 
 def lay_out(scene: Scene) -> Diagram:
-    return lay_out_circuit(describe_parts(scene, {}), scene.grounding.connection, find_current_lead(scene))
+    return lay_out_circuit(scene.describe_parts({}), scene.grounding.connection, scene.find_current_lead())
 
 
 def texts(svg: str) -> list[str]:
@@ -114,7 +113,7 @@ def test_drawing_is_the_circuit_that_is_fitted(name: str):
 @pytest.mark.parametrize("name", SCENES)
 def test_parts_have_their_values_and_no_others_are_drawn(name: str):
     scene = Scene.from_dict(SCENES[name])
-    shown = texts(scene_circuit(scene, {"Rsc": summarize_log_normal("Rsc", 123456.0, 0.05)}))
+    shown = texts(scene.draw_circuit({"Rsc": summarize_log_normal("Rsc", 123456.0, 0.05)}))
     leaks = scene.device.Ri is not None
     expected = {
         "Ci\n1.35 nF" if leaks else "Ci 1.35 nF",
@@ -152,14 +151,14 @@ def test_parts_have_their_values_and_no_others_are_drawn(name: str):
 def test_tied_and_fixed_parts_have_the_values_that_the_fit_gives_them():
     prior = {"grounding_Rsc": {"tied": "Rsc", "ratio": 2.0}, "R_H": {"fixed": 700.0}, "Rgap": {"low": 1e5, "high": 1e6}}
     fitted = {"Rsc": summarize_log_normal("Rsc", 100e3, 0.05)}
-    parts = describe_parts(Scene.from_dict({"prior": prior, "gap": {"thickness": "2 um"}}), fitted)
+    parts = Scene.from_dict({"prior": prior, "gap": {"thickness": "2 um"}}).describe_parts(fitted)
     assert (parts["grounding_Rsc"], parts["R_H"], parts["Rgap"]) == ("200\n± 10 kΩ", "700 Ω", "")
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_wiring_has_what_the_scene_measures(name: str):
     scene = Scene.from_dict(SCENES[name])
-    shown = texts(scene_wiring(scene))
+    shown = texts(scene.draw_wiring())
     assert {"amplifier", "electrode", "insulator", "finger", "1: V"} <= set(shown)
     assert ({"2 +: Vsc", "2 −: Vsc"} <= set(shown)) == ("Vsc" in scene.measurement.channels)
     assert ("ground electrode" in shown) == (scene.grounding.connection == "direct")
@@ -169,7 +168,7 @@ def test_wiring_has_what_the_scene_measures(name: str):
 
 
 def test_drawing_takes_the_colour_of_its_page_and_has_a_title():
-    svg = scene_circuit(Scene())
+    svg = Scene().draw_circuit()
     root = ET.fromstring(svg)
     assert root.get("role") == "img"
     assert root[0].tag.endswith("title")
