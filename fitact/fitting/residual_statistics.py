@@ -134,5 +134,5 @@ def interpolation_errors(
     voltage: Float[np.ndarray, "*records samples"], noise: Float[np.ndarray, "*records"]
 ) -> Float[np.ndarray, "*records"]:
     """Return the error (V) of linear interpolation of smooth drives, from their second differences less their noise."""
-    bend = row_medians(np.abs(np.diff(voltage, 2)))
+    bend = row_medians(np.abs(np.diff(np.diff(voltage).astype(np.float32))))
     return np.sqrt(np.maximum(bend**2 - 1.5 * 6.0 * (0.6744897501960817 * noise) ** 2, 0.0)) / 8.0
