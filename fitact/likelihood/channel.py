@@ -261,7 +261,7 @@ class ChannelLikelihood(eqx.Module):
         """Return the signal in the coordinates of a table, and whether the table covers it."""
         delay = self.timing.shift + inputs.delay
         covered = table.covers(jnp.stack(jnp.broadcast_arrays(*terms.tau)), delay)
-        response = inputs.gain * table.response(terms, delay, self.electrical.noise_gain)
+        response = inputs.gain * table.response(terms, delay, self.electrical.noise_gain / inputs.gain)
         if self.samples.charges is not None:
             response = response + inputs.gain * inputs.delay * table.rows_delay_derivative(terms)
         if inputs.effects is not None:

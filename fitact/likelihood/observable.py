@@ -101,7 +101,7 @@ class ElectricalSignal(Observable):
     channel: Channel = eqx.field(static=True)  # "Vsc", "I", or the voltage that generates a force
     steady_state: bool = eqx.field(static=True)  # or from rest
     smooth: Float[Array, " samples"] | None = None  # recorded drive as a delay shifts it (`smooth_drive`), V
-    noise_gain: ArrayLike = 0.0  # of the rest of the drive, for all parameters and delays
+    noise_gain: ArrayLike = 0.0  # of the rest of the drive, for all parameters, gains and delays
     # number of the fastest time constants that are so short that I follows dV/dt instead, later by them
     lags: int = eqx.field(static=True, default=0)
 
@@ -144,7 +144,7 @@ class ElectricalSignal(Observable):
         else:
             time = self.timing.drive_time(samples.time, inputs.delay + extra_delay, inputs.clock)
         if self.smooth is not None and not undelayed:
-            return inputs.gain * self._delay_smooth_drive(samples.time, inputs, time)
+            return self._delay_smooth_drive(samples.time, inputs, time)
         total, rate = self.response_and_rate(inputs, time)
         if rate is not None and charges is not None:
             total = jnp.interp(
@@ -157,8 +157,8 @@ class ElectricalSignal(Observable):
     def _delay_smooth_drive(self, recorded: Array, inputs: ChannelInputs, time: Array) -> Float[Array, " samples"]:
         """Return the response at the drive's `time` to the smooth drive, with the rest of the drive as `recorded`.
 
-        A parameter or a delay that made the noise of V smaller would be drawn there. So the noise has a gain that is
-        the same for all.
+        A parameter, a gain or a delay that made the noise of V smaller would be drawn there. So the noise has a gain
+        that is the same for all.
         """
         assert isinstance(self.drive, Sampled)
         smooth = dataclasses.replace(self.drive, samples=self.smooth)
@@ -167,7 +167,7 @@ class ElectricalSignal(Observable):
         if inputs.stray is not None:  # mean over a step, as in a table
             later, earlier = (smooth.value(time + part * self.timing.step) for part in (0.5, -0.5))
             total = total + inputs.stray / self.timing.step * (later - earlier)
-        return total + self.noise_gain * rest.value(recorded)
+        return inputs.gain * total + self.noise_gain * rest.value(recorded)
 
     def response_and_rate(self, inputs: ChannelInputs, time: Array) -> tuple[Array, ArrayLike | None]:
         """Return the response without what follows dV/dt, and the capacitance that does (F), or None."""

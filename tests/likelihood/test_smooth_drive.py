@@ -95,6 +95,23 @@ def test_a_delay_is_not_drawn_between_two_samples(skew: int, noise_V: float):
         assert abs(np.mean(each)) < 3.5 / np.sqrt(len(each)), name
 
 
+def test_the_noise_of_V_says_nothing_of_a_gain():
+    """The data know the product of gain and g alone. A smaller gain that made the noise smaller was off by 22 u."""
+    scene = fitact.Scene.from_dict({"drive": {"waveform": "measured"}, "measurement": {"gain_relative_sd": 0.01}})
+    fit = fitact.fit(record(0, 2, 1.0, bits=9), scene)
+    gain, found, (Rsc, Csc, Ci) = fit.names.index("gain"), fit.derived()["g"], np.exp(fit.theta[:3])
+    assert abs(fit.theta[gain]) < 0.1 * fit.sd[gain]
+    assert abs(np.log(found["q50"] / SKIN[2] * (2.0 * SKIN[2] + SKIN[1]))) < 3.5 * found["u"]
+    smaller = np.array(fit.point)  # of the same b and product
+    smaller[gain] -= 0.03
+    total = np.exp(-0.03) * (2.0 * Ci + Csc)
+    smaller[:3] = np.log([Rsc * np.exp(0.03), total - 2.0 * Ci, Ci])
+    for likelihood in (fit.likelihood, fit.likelihood.without_compression()):
+        with jax.enable_x64(True):
+            equal, other = (float(likelihood.log_likelihood(each)) for each in (fit.point, smaller))
+        assert other == pytest.approx(equal, abs=1e-4)
+
+
 @pytest.mark.parametrize("bits", [9, 12])
 @pytest.mark.parametrize("waveform", ["triangle", "sine"])
 def test_a_skew_that_nobody_stated_is_in_the_uncertainty(waveform: str, bits: int):
