@@ -35,12 +35,12 @@ from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.observable import LINEAR_NUISANCES
 from fitact.likelihood.projection import MAX_DELAY, is_exactly_uniform
-from fitact.likelihood.smooth_drive import smooth_drive
+from fitact.likelihood.smooth_drive import missing_curve, smooth_drive
 from fitact.model.circuit import passes_direct_current
 from fitact.model.force import force_constant
 from fitact.model.response_table import ResponseTable, chebyshev
 from fitact.model.skin import WithSkin
-from fitact.problem.build import MIN_RELATIVE_NOISE, Problem, edge_gain_sd
+from fitact.problem.build import MIN_RELATIVE_NOISE, Problem, edge_gain_sd, smooth_recorded_drive
 from fitact.problem.drive_choice import has_unresolved_edge, has_unresolved_edges
 from fitact.problem.instrument_errors import log_sd
 
@@ -78,10 +78,11 @@ class RecordedDriveProblem(BatchProblem):
     repeat: int | None
 
     @classmethod
-    def from_fit(cls, fitted: Fit, problem: Problem, count: int) -> Self | None:
+    def from_fit(cls, fitted: Fit, problem: Problem, count: int, max_curve: float = 1e-4) -> Self | None:
         """Make the problem for `count` records like that of a fit to `problem`, or None if batches cannot fit them.
 
-        They have the timing of this one; a delay that nobody expected is for separate fits.
+        They have the timing of this one; a delay that nobody expected is for separate fits, and so is a drive that
+        curves between its samples by more than `max_curve` of its sd, by which the force would be wrong.
         """
         likelihood, record, choice = fitted.likelihood, fitted.record, fitted.choice
         (trace, *others), time, tau = likelihood.channels, record.time, likelihood.evaluate_circuit(fitted.theta).tau
@@ -95,7 +96,12 @@ class RecordedDriveProblem(BatchProblem):
             return None
         delay = float(likelihood.to_physical(fitted.theta).get("delay", 0.0))
         origin = round(float(trace.timing.shift / trace.timing.step))
-        shared = SharedFunctions.from_times(time, float(tau[0]), origin)
+        smooth, curve = smooth_recorded_drive(record), 0.0
+        if smooth is not None and not np.array_equal(smooth, np.asarray(trace.electrical.smooth)):
+            curve = float(missing_curve(delay / float(trace.timing.step)))
+            if interpolation_errors(smooth, 0.0) > max_curve * np.std(smooth):
+                return None
+        shared = SharedFunctions.from_times(time, float(tau[0]), origin, curve)
         counted = np.flatnonzero(trace.samples.weights[: time.size] == 1.0)
         if abs(origin) > MAX_DELAY - AGES or not np.array_equal(counted, np.arange(MAX_DELAY, time.size - MAX_DELAY)):
             return None

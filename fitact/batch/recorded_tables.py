@@ -19,7 +19,7 @@ from fitact.batch.gauss_newton import decompose_qr, substitute_back
 from fitact.compiled import jit, map_blocks
 from fitact.likelihood.compression import BASELINE_NAMES, split_functions
 from fitact.likelihood.projection import MAX_DELAY, evaluate_baseline, root_products, uniform_recurrence
-from fitact.likelihood.smooth_drive import smooth_drive
+from fitact.likelihood.smooth_drive import lasting_bend, smooth_drive
 from fitact.model.response_table import (
     NODES,
     TABLE_HALF_WIDTH,
@@ -48,6 +48,7 @@ class SharedFunctions(NamedTuple):
         center: center of the range of log tau, whose half-width is `TABLE_HALF_WIDTH`.
         time_step: s.
         origin: delay of the first record in time steps, rounded.
+        curve: part of the second differences of a drive that is added to it (`missing_curve`).
     """
 
     functions: Float[Array, "shared samples"]
@@ -58,12 +59,13 @@ class SharedFunctions(NamedTuple):
     center: Float[Array, ""]
     time_step: Float[Array, ""]
     origin: Int[Array, ""]
+    curve: Float[Array, ""]
 
     @classmethod
-    def from_times(cls, time: Float[np.ndarray, " samples"], tau: float, origin: int) -> Self:
+    def from_times(cls, time: Float[np.ndarray, " samples"], tau: float, origin: int, curve: float) -> Self:
         """Return the functions at uniform times (s), for time constants around `tau` (s).
 
-        `origin` is as in the attributes.
+        `origin` and `curve` are as in the attributes.
         """
         x, to_series = chebyshev(NODES)
         decays = np.exp(-(time - time[0])[:, None] / (tau * np.exp(TABLE_HALF_WIDTH * x)))
@@ -77,7 +79,7 @@ class SharedFunctions(NamedTuple):
         is_fitted = np.zeros(time.size)
         is_fitted[MAX_DELAY - origin : time.size - MAX_DELAY - origin] = 1.0
         fitted_functions = is_fitted * np.roll(functions, -origin, axis=1)
-        numbers = np.asarray(math.log(tau)), np.asarray(step), np.asarray(origin)
+        numbers = np.asarray(math.log(tau)), np.asarray(step), np.asarray(origin), np.asarray(curve)
         return cls(functions, is_fitted, fitted_functions, baseline.T, decay @ to_series.T, *numbers)
 
     @property
@@ -104,9 +106,10 @@ class SharedFunctions(NamedTuple):
 
         They are those at the times of the drive, i.e. without the delay `origin`. `smooth` is V without its noise.
         """
-        x, samples = self.time_step / tau, V.size
+        x, samples, noise = self.time_step / tau, V.size, V - smooth
+        smooth = smooth + self.curve * lasting_bend(smooth)
         rises = jnp.diff(jnp.pad(smooth, (AGES + 1, AGES), mode="edge")) / self.time_step
-        steps = [*(rises[AGES - age : AGES - age + samples] for age in range(-AGES, AGES)), V - smooth]
+        steps = [*(rises[AGES - age : AGES - age + samples] for age in range(-AGES, AGES)), noise]
         # the first sample is a jump from 0
         rise = jnp.pad(jnp.diff(smooth, prepend=smooth[:1]), (0, -samples % _BLOCK))
         u = uniform_recurrence(rise, smooth[0] * jnp.exp(x), x, _BLOCK)[:, :samples]

@@ -106,7 +106,8 @@ class ChannelFit:
             # a delayed response lies between the samples of V
             b = 0.0 if "delay" in channel.timing.free and channel.samples.charges is None else float(optimum.b)
             whole = white, source.record.time[counted], noise, n_fitted, _gain(optimum, channel)
-            figures = channel_statistics(*whole, source.record, channel.channel, source.choice, b)
+            how = source.record, channel.channel, source.choice, b
+            figures = channel_statistics(*whole, *how, is_curved=channel.may_curve_drive)
             figures |= of_rows
             figures |= _weighted_statistics(channel, residuals, weight, counted, source.record.time, source.noise)
             if samples.has_drive_noise:  # at edges and ends, samples of dV/dt are wrong, and rows are not

@@ -26,12 +26,15 @@ def channel_statistics(
     channel: str,
     choice: DriveModel,
     b: float,
+    *,
+    is_curved: bool,
 ) -> dict[str, float]:
     """Return figures of merit of the weighted residuals of a channel (in its unit) after fitting `n_fitted` parameters.
 
     `noise` is the model-free noise estimate of the channel. The noise of a measured drive adds to it, multiplied by
     `gain` (unit of the channel per V). At the samples of V, the response follows V but for a low-pass of it with the
-    time constant `b` (s), whose interpolation is all that may be wrong, unless `b` is 0.
+    time constant `b` (s), whose interpolation is all that may be wrong, unless `b` is 0. Between the samples, V is
+    linear, or a cubic if it `is_curved`.
     """
     measured, V = choice.name == "measured", choice.voltage
     expected = math.hypot(noise, gain * record.noise("V") if measured else 0.0)
@@ -41,7 +44,7 @@ def channel_statistics(
     # single precision suffices for the tests
     structure = ResidualTestStatistics.from_residuals((residuals / unit).astype(np.float32), bins)
     figures = residual_statistics(square, count, structure, np.asarray(expected), count - n_fitted, bins)
-    interpolated = float(interpolation_errors(V, white_noise_sds(V)))
+    interpolated = float(interpolation_errors(V, white_noise_sds(V), is_curved=is_curved))
     delayed = float(np.median(np.abs(np.diff(V)))) * record.time_step / (8.0 * b) if b else math.inf
     return {name: float(value) for name, value in figures.items()} | {
         "rounding_noise": rounding_noise_sd(record[channel]),
@@ -131,8 +134,13 @@ def is_undersampled(figures: Mapping[str, ArrayLike]) -> Bool[np.ndarray, "*reco
 
 
 def interpolation_errors(
-    voltage: Float[np.ndarray, "*records samples"], noise: Float[np.ndarray, "*records"]
+    voltage: Float[np.ndarray, "*records samples"], noise: ArrayLike, *, is_curved: bool = False
 ) -> Float[np.ndarray, "*records"]:
-    """Return the error (V) of linear interpolation of smooth drives, from their second differences less their noise."""
-    bend = row_medians(np.abs(np.diff(np.diff(voltage).astype(np.float32))))
-    return np.sqrt(np.maximum(bend**2 - 1.5 * 6.0 * (0.6744897501960817 * noise) ** 2, 0.0)) / 8.0
+    """Return the error (V) of linear interpolation of smooth drives, from their second differences less their noise.
+
+    If the interpolation `is_curved`, it is that of cubics, from fourth differences.
+    """
+    order, variance, part = (4, 70.0, 3.0 / 128.0) if is_curved else (2, 6.0, 1.0 / 8.0)
+    bend = row_medians(np.abs(np.diff(np.diff(voltage).astype(np.float32), order - 1)))
+    noise = 0.6744897501960817 * np.asarray(noise)
+    return part * np.sqrt(np.maximum(bend**2 - 1.5 * variance * noise**2, 0.0))

@@ -9,7 +9,7 @@ from fitact.fitting.instrument_effects import effects_would_change, fill_effects
 from fitact.fitting.least_squares import LeastSquaresResult, solve
 from fitact.fitting.multistart import choose_start
 from fitact.fitting.row_updates import estimate_drives, update_rows
-from fitact.fitting.timing import shift_whole_steps, start_delays
+from fitact.fitting.timing import curve_drives, shift_whole_steps, start_delays
 from fitact.likelihood import certificate
 from fitact.likelihood.likelihood import Likelihood
 from fitact.problem.build import Problem
@@ -29,13 +29,13 @@ def solve_problem(
 ) -> tuple[LeastSquaresResult, certificate.CertifiedLikelihood, np.ndarray]:
     """Fit, and fit again while effects of instruments for the new optimum would differ by more than `max_change`.
 
-    Also after the noise of V was moved with Vsc, while weights of spectra change by more than a thousandth, or a
-    current with a recorded drive by more than `max_skew` time steps, or the parameters with the estimate of its drive
-    by more than `max_change` standard errors. It does not go on after `max_steps` of the search, of which a model that
-    is wrong may need many. A current with a recorded drive that has not settled ends with its most probable fit.
-    A delay that is known to a tenth of a step may change without end, by up to half a step, if the other parameters
-    follow it by less than a twentieth of a standard error. Tables are verified at the end; the samples of channels
-    whose table fails are summed from there on.
+    Also after the noise of V was moved with Vsc or V was curved, while weights of spectra change by more than a
+    thousandth, or a current with a recorded drive by more than `max_skew` time steps, or the parameters with the
+    estimate of its drive by more than `max_change` standard errors. It does not go on after `max_steps` of the search,
+    of which a model that is wrong may need many. A current with a recorded drive that has not settled ends with its
+    most probable fit. A delay that is known to a tenth of a step may change without end, by up to half a step, if the
+    other parameters follow it by less than a twentieth of a standard error. Tables are verified at the end; the samples
+    of channels whose table fails are summed from there on.
 
     A start far from the answer may lead delays astray, by more steps than the rounds lead them back. A fit that has not
     settled, with a delay of more than `max_late` prior standard deviations, starts again from its circuit, without its
@@ -65,7 +65,8 @@ def solve_problem(
             is_settled = change <= 1e-3
         sd = np.linalg.norm(root[places], axis=1)
         shifted, theta = shift_whole_steps(likelihood, theta, sd)
-        is_settled, likelihood = is_settled and shifted is likelihood, shifted
+        curved = curve_drives(shifted, theta, solved.sigma, problem.sources)
+        is_settled, likelihood = is_settled and curved is likelihood, curved
         if has_rows:
             moved = np.abs(theta - before) / sd
             skew = np.max(np.abs(theta), where=likelihood.follows_rows, initial=0.0)

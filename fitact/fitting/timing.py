@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -16,10 +16,13 @@ from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import student_weight
 from fitact.likelihood.observable import TIMING_NUISANCES, ChannelInputs
+from fitact.likelihood.smooth_drive import lasting_bend, missing_curve
 from fitact.model.drive import Sampled
 from fitact.model.response import highpass
 from fitact.model.skin import constant_skin_circuit
+from fitact.problem.build import smooth_recorded_drive
 from fitact.problem.drive_choice import has_ideal_edges, has_unresolved_edge, ideal_edge_mask
+from fitact.problem.source import Source
 
 
 def free_timing(
@@ -103,6 +106,36 @@ def shift_whole_steps(
         late = dataclasses.replace(late, observable=late.electrical.delay_noise(steps))
         likelihood, theta[place] = likelihood.replace_channel(i, late), theta[place] - steps
     return likelihood, theta
+
+
+def curve_drives(
+    likelihood: Likelihood,
+    theta: Float[np.ndarray, " parameters"],
+    sigma: Float[np.ndarray, " channels"],
+    sources: Sequence[Source],
+    max_change: float = 0.3,
+) -> Likelihood:
+    """Return the likelihood in which recorded drives, linear between samples, are cubic for a delay by part of a step.
+
+    Between two samples, a line misses a curve by part (1 - part) / 2 of its second differences, which are added. The
+    likelihood is the same if no Vsc changes by more than `max_change` standard errors.
+    """
+    for i, channel in _delayed_channels(likelihood):
+        smooth = smooth_recorded_drive(sources[i].in_time) if channel.may_curve_drive else None
+        if smooth is None:
+            continue
+        drive, now = channel.electrical.drive, np.asarray(channel.electrical.smooth)
+        assert isinstance(drive, Sampled)
+        late = theta[likelihood.names.index(channel.qualified_name("delay"))]
+        late += float(channel.timing.shift) / float(channel.timing.step)
+        curved = smooth + missing_curve(late) * lasting_bend(smooth)
+        gain = float(np.sum(np.abs(likelihood.evaluate_circuit(theta).terms[channel.channel].weight)))
+        change = gain * np.linalg.norm((curved - now) * np.sqrt(channel.samples.weights)) / float(sigma[i])
+        if change > max_change:
+            drive = dataclasses.replace(drive, samples=curved + (np.asarray(drive.samples) - now))
+            channel = channel.without_compression().replace_observable(drive=drive, smooth=curved)
+            likelihood = likelihood.replace_channel(i, channel)
+    return likelihood
 
 
 def _delayed_channels(likelihood: Likelihood) -> Iterator[tuple[int, ChannelLikelihood]]:

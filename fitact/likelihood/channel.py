@@ -75,6 +75,13 @@ class ChannelLikelihood(eqx.Module):
         return self.observable.electrical
 
     @property
+    def may_curve_drive(self) -> bool:
+        """Whether a recorded drive may be curved between its samples; that of a limited current is estimated."""
+        if "delay" not in self.timing.free or not self.observable.follows_samples or self.samples.has_drive_noise:
+            return False
+        return self.electrical.smooth is not None
+
+    @property
     def shifts_response(self) -> bool:
         """Whether a delay or clock error shifts the response; rows of charge are shifted to first order."""
         return bool(self.timing.free) and self.samples.charges is None

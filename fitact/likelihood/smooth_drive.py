@@ -38,6 +38,25 @@ def smooth_drive(V: Any, noise: ArrayLike, transition: float = 1.5) -> Any:
     return smooth
 
 
+def second_differences(V: Any) -> Any:
+    """Return the second differences of V (samples) around each sample."""
+    return array_module(V).diff(V, 2, prepend=V[:1], append=V[-1:])
+
+
+def lasting_bend(V: Any) -> Any:
+    """Return the second differences of V (samples) without those of single corners: medians of three."""
+    xp = array_module(V)
+    bend = xp.pad(second_differences(V), 1)
+    before, here, after = bend[:-2], bend[1:-1], bend[2:]
+    return xp.maximum(xp.minimum(before, after), xp.minimum(xp.maximum(before, after), here))
+
+
+def missing_curve(late: ArrayLike) -> ArrayLike:
+    """Return the part of second differences that lines between samples lack where the drive is `late` (time steps)."""
+    part = late % 1.0
+    return -0.5 * part * (1.0 - part)
+
+
 def _smooth(V: Any) -> list[Any]:
     """Return V after each round, from none on, from the sample `_REACH` on; the ends are cut off round by round."""
     last, cut, scales = V, 0, [V[..., _REACH:]]

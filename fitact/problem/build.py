@@ -264,7 +264,7 @@ def _build_channel(
     # edges of a shifted drive are known only to within a step, which affects g; samples of I there are excluded
     has_delay = channel == "Vsc" or is_limited
     free = ("delay",) if has_delay and (choice.shift != 0.0 or skew_sd > 0.0) else ()
-    smooth = _smooth_drive(record) if can_smooth and has_delay else None
+    smooth = smooth_recorded_drive(record) if can_smooth and has_delay else None
     shift, step = (np.asarray(each, dtype=float) for each in (choice.shift, record.time_step))
     timing = DriveTiming(shift, np.zeros(()), step, _timing_sd(record, choice, channel, skew_sd), free)
     # without the samples of an unknown drive, a charge that decays within half a step is over
@@ -388,7 +388,7 @@ def _can_smooth(choice: DriveModel, template: Circuit) -> bool:
     return choice.name == "measured" and not choice.steady_state and not isinstance(template, WithSkin)
 
 
-def _smooth_drive(record: Record) -> Float[np.ndarray, " samples"] | None:
+def smooth_recorded_drive(record: Record) -> Float[np.ndarray, " samples"] | None:
     """Return V as a delay shifts it; None if it has no noise."""
     noise = record.noise("V")
     return pad_samples(smooth_drive(record["V"], noise)) if noise else None

@@ -24,7 +24,7 @@ from fitact.errors import InputError
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.charge_rows import LAG, ROW_NOISE, ChargeRows, RowCovariance, step_means, whiten_rows
 from fitact.likelihood.observable import ChannelInputs
-from fitact.likelihood.smooth_drive import smooth_drive
+from fitact.likelihood.smooth_drive import lasting_bend, second_differences, smooth_drive
 from fitact.model.circuit import gain_at
 from fitact.model.drive import Sampled
 from fitact.problem.jumps import Jumps
@@ -137,12 +137,12 @@ class RecordedCurrent:
     @functools.cached_property
     def bend(self) -> Rows:
         """Second differences of the smooth V, V."""
-        return np.diff(self.smooth, 2, prepend=self.smooth[:1], append=self.smooth[-1:])
+        return second_differences(self.smooth)
 
     @functools.cached_property
     def lasting_bend(self) -> Rows:
         """Second differences without those of single corners, V."""
-        return scipy.ndimage.median_filter(self.bend, 3)
+        return lasting_bend(self.smooth)
 
     @property
     def is_coarse(self) -> bool:

@@ -6,7 +6,7 @@ import pytest
 import scipy.signal
 
 import fitact
-from fitact.likelihood.smooth_drive import smooth_drive
+from fitact.likelihood.smooth_drive import lasting_bend, missing_curve, smooth_drive
 
 STEP, FINE = 6.25e-6, 8  # s, and fine steps of the truth in a step
 SKIN = np.array([160e3, 24e-9, 1.35e-9])
@@ -55,6 +55,10 @@ def record(
     turns = 2.0 * np.pi * 100.0 * fine
     V = 180.0 * (np.sin(turns) if waveform == "sine" else scipy.signal.sawtooth(turns, 0.5))
     V = np.clip(5.0 * V, -180.0, 180.0) if waveform == "trapezoid" else V
+    V = 90.0 * (np.sin(turns) + np.sin(41.0 * turns)) if waveform == "tones" else V
+    if waveform == "slewed":  # edges of 16 steps, with a pole of 3
+        pole = np.exp(-1.0 / (3 * FINE))
+        V = scipy.signal.lfilter([1.0 - pole], [1.0, -pole], np.clip(50.0 * V, -180.0, 180.0))
     Rsc, Csc, Ci = SKIN
     # of Rsc‖Csc, 1 / (s Ci) and R_H in the loop, exactly for linear pieces
     b, lag = Rsc * (2.0 * Ci + Csc), R_H * Ci
@@ -93,6 +97,30 @@ def test_a_delay_is_not_drawn_between_two_samples(skew: int, noise_V: float):
     for name, each in errors.items():
         assert np.max(np.abs(each)) < 3.5, name
         assert abs(np.mean(each)) < 3.5 / np.sqrt(len(each)), name
+
+
+@pytest.mark.parametrize("late", [0.1, 0.5, 1.7])
+def test_a_curved_drive_lies_on_the_curve_between_samples_and_corners_stay(late: float):
+    k = np.arange(200.0)
+    sine = np.sin(0.3 * k)
+    curved = sine + missing_curve(late) * lasting_bend(sine)
+    missed, left = (np.interp(k - late, k, each) - np.sin(0.3 * (k - late)) for each in (sine, curved))
+    assert np.max(np.abs(left[5:-5])) < 0.1 * np.max(np.abs(missed[5:-5]))
+    for corners in (np.abs(k - 100.0), np.clip(k - 100.0, 0.0, 2.0), 1.0 * (k > 100.0)):
+        assert not lasting_bend(corners).any()
+
+
+@pytest.mark.parametrize("skew", [3, 4, 13])
+def test_a_fast_tone_is_not_cut_between_samples(skew: int):
+    """Lines cut 0.3 % of a tone of 39 samples per period: g was off by 0.16 %, and noise and errors were larger."""
+    scene = fitact.Scene.from_dict({"drive": {"waveform": "measured"}, "prior": {"Ci": {"relative_sd": 0.1}}})
+    fit, truth = fitact.fit(record(0, skew, 0.02, waveform="tones"), scene), SKIN[2] / (2.0 * SKIN[2] + SKIN[1])
+    found, delay = fit.derived()["g"], fit.parameters()["delay"]
+    assert fit.result == "successful"
+    assert fit.sigma == pytest.approx(0.02, rel=0.05)
+    assert found["u"] < 2e-4
+    assert abs(np.log(found["q50"] / truth)) < 3.5 * found["u"]
+    assert abs(delay["q50"] - skew * STEP / FINE) < 3.5 * delay["sd"]
 
 
 def test_the_noise_of_V_says_nothing_of_a_gain():
