@@ -151,7 +151,7 @@ def test_the_stated_errors_hold_for_a_skew_of_an_eighth_of_a_step():
 
 
 def test_drives_that_curve_between_samples_are_curved_in_batches():
-    """With lines between the samples of slewed edges, b was off by 0.8 standard errors."""
+    """Lines between the samples of slewed edges moved b by 0.8 standard errors."""
     scene = fitact.Scene.from_dict({"drive": {"waveform": "measured"}, "prior": {"Ci": {"relative_sd": 0.1}}})
     records = [slow_record(seed, 3, 0.02, bits=14, waveform="slewed") for seed in range(16)]
     assert accepted(records, scene).all()
