@@ -37,7 +37,7 @@ def channel_warnings(record: Record, choice: DriveModel, channel: str, figures: 
         )
     if is_undersampled(figures):
         warnings.append(
-            "V_V is sampled too coarsely for linear interpolation (its error in Vsc is"
+            "V_V is sampled too coarsely to be interpolated (its error in Vsc is"
             f" {format_engineering(figures['interpolation_error'], 'V')}); record faster, or state the waveform in a"
             " scene"
         )

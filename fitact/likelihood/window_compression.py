@@ -32,7 +32,7 @@ from fitact.likelihood.projection import (
     evaluate_baseline,
     factor_products,
 )
-from fitact.likelihood.smooth_drive import smooth_drive
+from fitact.likelihood.smooth_drive import lasting_bend, missing_curve, smooth_drive
 from fitact.model.response_table import count_nodes
 
 REACH = 4.0  # factor by which b may change
@@ -73,14 +73,22 @@ class WindowCompressor:
     shared: tuple[Float[np.ndarray, "functions samples"], ...]
     noise_V: float  # sd of the noise of V, V; 0 if the channels respond to V with its noise
     short: int  # number of the fastest time constants that are not in the tables
+    late: float  # delay of Vsc in time steps
 
     @classmethod
     def from_channels(
-        cls, channels: Sequence[ChannelLikelihood], circuit: CircuitValues, samples: int, step: float, noise_V: float
+        cls,
+        channels: Sequence[ChannelLikelihood],
+        circuit: CircuitValues,
+        samples: int,
+        step: float,
+        noise_V: float,
+        late: float,
     ) -> Self:
         """Make the tables around the time constants of a circuit, a factor `REACH` either way.
 
-        `noise_V` is the sd of the noise of V, to which a channel whose response may be delayed does not respond.
+        `noise_V` is the sd of the noise of V, to which a channel whose response may be delayed does not respond, and
+        `late` the delay of Vsc in time steps.
         """
         time, short = step * np.arange(samples), channels[0].count_untabulated(circuit.tau)
         is_single = circuit.tau.size - short == 1
@@ -98,7 +106,7 @@ class WindowCompressor:
             tables.append(table)
             shared.append(functions if each.samples.charges is None else step_means(functions))
         noise = noise_V if any(each.shifts_response for each in channels) else 0.0
-        return cls(tuple(channels), tuple(tables), time, tuple(shared), noise, short)
+        return cls(tuple(channels), tuple(tables), time, tuple(shared), noise, short, late)
 
     def compress(
         self,
@@ -121,7 +129,10 @@ class WindowCompressor:
         np.multiply(late, combined[:TREND_RANK], out=functions[rank:-2])
         functions[-2], found, steps = V, [], np.empty((0, V.size))
         if any(each.shifts_response for each in self.channels):
-            steps = drive_steps(smooth, V - smooth, 0, V.size, float(self.time[1]))
+            # beside its noise, V has what lines between its samples lack
+            number = np.arange(float(V.size))
+            curve = missing_curve(self.late) * np.interp(number - self.late, number, lasting_bend(smooth))
+            steps = drive_steps(smooth, V - smooth + curve, 0, V.size, float(self.time[1]))
         for i, pair in enumerate(zip(given, weights, strict=True)):
             functions[-1] = self.tables[i].expected @ responses
             found.append(self._compress_channel(i, late, functions, steps, *pair, has_charge))

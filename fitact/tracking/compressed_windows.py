@@ -196,7 +196,8 @@ def find_model(windows: Sequence[Window], scene: Scene, step: float, source: str
     with double_precision():
         circuit = fitted.likelihood.evaluate_circuit(fitted.theta)
         fitted_channels, noise_V = fitted.likelihood.channels, record.noise("V")
-        compressor = WindowCompressor.from_channels(fitted_channels, circuit, time.size, step, noise_V)
+        late = fitted.likelihood.to_physical(fitted.theta).get("delay", 0.0) / step
+        compressor = WindowCompressor.from_channels(fitted_channels, circuit, time.size, step, noise_V, float(late))
     parts = max(1, math.floor((time[-1] + step) * frequency))
     current = _describe_current(fitted, record, circuit)
     return WindowModel(fitted, compressor, parts, float(np.std(first.channels["V"])), current, circuit.tau)

@@ -141,6 +141,26 @@ def test_fit_of_a_constant_finger_names_the_change(slide):
     assert "during the record: use track" in fitted.message
 
 
+def test_fast_tones_are_not_cut_between_samples():
+    """Lines cut 0.3 % of a tone of 39 samples per period, and moved g by 0.18 %."""
+    Rsc, Csc, Ci = 160e3, 24e-9, 1.35e-9
+    time, total = 6.25e-6 * np.arange(32_000), 2.0 * Ci + Csc
+    omega, rng = 2.0 * np.pi * np.array([[100.0], [4100.0]]), np.random.default_rng(3)
+    gain = Ci * Rsc * 1j * omega / (1.0 + Rsc * total * 1j * omega)
+    late = time - 0.4 * 6.25e-6
+    V, Vsc = (
+        90.0 * np.sum(each.imag, axis=0) for each in (np.exp(1j * omega * time), gain * np.exp(1j * omega * late))
+    )
+    channels = {}
+    for name, values in (("V", V), ("Vsc", Vsc)):
+        noisy, lsb = values + 0.02 * rng.standard_normal(time.size), 1.2 * np.ptp(values) / 2**14
+        channels[name] = lsb * np.round(noisy / lsb)
+    scene = fitact.Scene.from_dict({"drive": {"waveform": "measured"}, "prior": {"Ci": {"relative_sd": 0.1}}})
+    track = fitact.track(fitact.Record.from_arrays(time, **channels), scene)
+    assert track.trusted
+    np.testing.assert_allclose(track.to_dataframe()["g"], Ci / total, rtol=2e-4)
+
+
 def test_stationary_record_gives_the_answer_of_a_fit():
     record, course = simulate(duration=1.0)
     fitted, found = fitact.fit(record, SCENE), fitact.track(record, SCENE)
