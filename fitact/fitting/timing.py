@@ -120,18 +120,18 @@ def curve_drives(
     Between two samples, a line misses a curve by part (1 - part) / 2 of its second differences, which are added. The
     likelihood is the same if no Vsc changes by more than `max_change` standard errors.
     """
-    for i, channel in _delayed_channels(likelihood):
-        smooth = smooth_recorded_drive(sources[i].in_time) if channel.may_curve_drive else None
-        if smooth is None:
+    for i, (channel, source) in enumerate(zip(likelihood.channels, sources, strict=True)):
+        if not channel.may_curve_drive:
             continue
-        drive, now = channel.electrical.drive, np.asarray(channel.electrical.smooth)
+        electrical, smooth = channel.electrical, smooth_recorded_drive(source.in_time)
+        drive, now = electrical.drive, np.asarray(electrical.smooth)
         assert isinstance(drive, Sampled)
+        assert smooth is not None
         late = theta[likelihood.names.index(channel.qualified_name("delay"))]
         late += float(channel.timing.shift) / float(channel.timing.step)
         curved = smooth + missing_curve(late) * lasting_bend(smooth)
-        gain = float(np.sum(np.abs(likelihood.evaluate_circuit(theta).terms[channel.channel].weight)))
-        change = gain * np.linalg.norm((curved - now) * np.sqrt(channel.samples.weights)) / float(sigma[i])
-        if change > max_change:
+        changes = np.asarray(electrical.noise_gain) * (curved - now) / sigma[i]
+        if np.linalg.norm(changes * np.sqrt(channel.samples.weights)) > max_change:
             drive = dataclasses.replace(drive, samples=curved + (np.asarray(drive.samples) - now))
             channel = channel.without_compression().replace_observable(drive=drive, smooth=curved)
             likelihood = likelihood.replace_channel(i, channel)
