@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Self
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from fitact.batch.batch_problem import SAMPLE_BLOCK, BatchFit, BatchProblem, Screening, stack_channel
@@ -35,7 +36,7 @@ from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.observable import LINEAR_NUISANCES
 from fitact.likelihood.projection import MAX_DELAY, is_exactly_uniform
-from fitact.likelihood.smooth_drive import missing_curve, smooth_drive
+from fitact.likelihood.smooth_drive import missing_curve
 from fitact.model.circuit import passes_direct_current
 from fitact.model.force import force_constant
 from fitact.model.response_table import ResponseTable, chebyshev
@@ -82,7 +83,7 @@ class RecordedDriveProblem(BatchProblem):
         """Make the problem for `count` records like that of a fit to `problem`, or None if batches cannot fit them.
 
         They have the timing of this one; a delay that nobody expected is for separate fits, and so is a drive that
-        curves between its samples by more than `max_curve` of its sd, by which the force would be wrong.
+        curves between its samples by more than `max_curve` of its sd, as fast tones do.
         """
         likelihood, record, choice = fitted.likelihood, fitted.record, fitted.choice
         (trace, *others), time, tau = likelihood.channels, record.time, likelihood.evaluate_circuit(fitted.theta).tau
@@ -101,7 +102,7 @@ class RecordedDriveProblem(BatchProblem):
             curve = float(missing_curve(delay / float(trace.timing.step)))
             if interpolation_errors(smooth, 0.0) > max_curve * np.std(smooth):
                 return None
-        shared = SharedFunctions.from_times(time, float(tau[0]), origin, curve)
+        shared = SharedFunctions.from_times(time, float(tau[0]), origin, curve, record.tones)
         counted = np.flatnonzero(trace.samples.weights[: time.size] == 1.0)
         if abs(origin) > MAX_DELAY - AGES or not np.array_equal(counted, np.arange(MAX_DELAY, time.size - MAX_DELAY)):
             return None
@@ -311,9 +312,12 @@ def _evaluate_records(
         own = shared.filter_drive(v, vsc, table_nodes(center), smooth_v)
         shared_part, own_part = jnp.split(optimum.fitted, [shared.size])
         model = shared_part @ shared.fitted_functions + sum(c * row for c, row in zip(own_part, own, strict=False))
-        # the voltage is not delayed, so that the steps of the drive have no part in it
+        # the voltage is not delayed, so that the steps of the drive have no part in it, nor the curve between samples
         times = slice(begin, begin + contact[0].size)
-        forces = _derive_record(own[:TABLE_NODES, times], shared.functions[:, times], contact, optimum)
+        responses = lax.cond(
+            shared.curve == 0.0, lambda: own[:TABLE_NODES], lambda: shared.respond(smooth_v, table_nodes(center))
+        )
+        forces = _derive_record(responses[:, times], shared.functions[:, times], contact, optimum)
         return shared.select_fitted(own[-1] - model), *forces
 
     residuals, logs, gradients = map_blocks(evaluate_record, (tau, optima, V, Vsc, smooth), RECORD_BLOCK)
@@ -369,7 +373,7 @@ def _tabulate_responses(
     def tabulate_record(record: tuple[Array, Array, Array]) -> ResponseTable:
         center, v, sd = record
         nodes = table_nodes(jnp.exp(center))
-        own = shared.filter_drive(v, jnp.zeros_like(v), nodes, smooth_drive(v, sd))[:TABLE_NODES]
+        own = shared.respond(shared.smooth_drive(v, sd), nodes)
         decays = (shared.decay @ shared.decay_polynomials(nodes)).T @ shared.functions
         signal, decay = (
             jnp.pad(series.T @ each[:, begin : begin + count], ((0, 0), (0, max(begin + count - v.size, 0)))).T

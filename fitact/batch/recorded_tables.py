@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from fitact.batch.gauss_newton import decompose_qr, substitute_back
 from fitact.compiled import jit, map_blocks
+from fitact.data.tones import Tones
 from fitact.likelihood.compression import BASELINE_NAMES, split_functions
 from fitact.likelihood.projection import MAX_DELAY, evaluate_baseline, root_products, uniform_recurrence
 from fitact.likelihood.smooth_drive import lasting_bend, smooth_drive
@@ -49,6 +50,7 @@ class SharedFunctions(NamedTuple):
         time_step: s.
         origin: delay of the first record in time steps, rounded.
         curve: part of the second differences of a drive that is added to it (`missing_curve`).
+        tones: orthonormal functions of which the first drive consists, if it consists of few tones.
     """
 
     functions: Float[Array, "shared samples"]
@@ -60,12 +62,15 @@ class SharedFunctions(NamedTuple):
     time_step: Float[Array, ""]
     origin: Int[Array, ""]
     curve: Float[Array, ""]
+    tones: Float[Array, "tones samples"]
 
     @classmethod
-    def from_times(cls, time: Float[np.ndarray, " samples"], tau: float, origin: int, curve: float) -> Self:
+    def from_times(
+        cls, time: Float[np.ndarray, " samples"], tau: float, origin: int, curve: float, tones: Tones | None
+    ) -> Self:
         """Return the functions at uniform times (s), for time constants around `tau` (s).
 
-        `origin` and `curve` are as in the attributes.
+        `origin` and `curve` are as in the attributes, `tones` those of the first drive.
         """
         x, to_series = chebyshev(NODES)
         decays = np.exp(-(time - time[0])[:, None] / (tau * np.exp(TABLE_HALF_WIDTH * x)))
@@ -80,7 +85,8 @@ class SharedFunctions(NamedTuple):
         is_fitted[MAX_DELAY - origin : time.size - MAX_DELAY - origin] = 1.0
         fitted_functions = is_fitted * np.roll(functions, -origin, axis=1)
         numbers = np.asarray(math.log(tau)), np.asarray(step), np.asarray(origin), np.asarray(curve)
-        return cls(functions, is_fitted, fitted_functions, baseline.T, decay @ to_series.T, *numbers)
+        basis = np.empty((0, time.size)) if tones is None else tones.basis()
+        return cls(functions, is_fitted, fitted_functions, baseline.T, decay @ to_series.T, *numbers, basis)
 
     @property
     def size(self) -> int:
@@ -90,6 +96,14 @@ class SharedFunctions(NamedTuple):
     def select_fitted(self, values: Float[Array, " samples"]) -> Float[Array, " used"]:
         """Return values at the times of the drive at the fitted samples, delayed by `origin`."""
         return lax.dynamic_slice(values, (MAX_DELAY - self.origin,), (values.size - 2 * MAX_DELAY,))
+
+    def smooth_drive(self, V: Float[Array, " samples"], noise: Float[Array, ""]) -> Float[Array, " samples"]:
+        """Return a drive without most of its white noise, of sd `noise` (V), as a single fit smooths it."""
+        smooth = smooth_drive(V, noise)
+        if not len(self.tones):
+            return smooth
+        tones = (self.tones @ V) @ self.tones
+        return jnp.where(jnp.std(V - tones) < 1.5 * noise, tones, smooth)
 
     def decay_polynomials(self, tau: Float[Array, " nodes"]) -> Float[Array, "terms nodes"]:
         """Return the polynomials in log tau whose coefficients are in `decay`."""
@@ -106,14 +120,18 @@ class SharedFunctions(NamedTuple):
 
         They are those at the times of the drive, i.e. without the delay `origin`. `smooth` is V without its noise.
         """
-        x, samples, noise = self.time_step / tau, V.size, V - smooth
+        samples, noise = V.size, V - smooth
         smooth = smooth + self.curve * lasting_bend(smooth)
         rises = jnp.diff(jnp.pad(smooth, (AGES + 1, AGES), mode="edge")) / self.time_step
         steps = [*(rises[AGES - age : AGES - age + samples] for age in range(-AGES, AGES)), noise]
+        return jnp.concatenate([self.respond(smooth, tau), jnp.stack([*steps, jnp.roll(Vsc, -self.origin)])])
+
+    def respond(self, drive: Float[Array, " samples"], tau: Float[Array, " nodes"]) -> Float[Array, "nodes samples"]:
+        """Return the responses to a drive at its samples."""
+        x = self.time_step / tau
         # the first sample is a jump from 0
-        rise = jnp.pad(jnp.diff(smooth, prepend=smooth[:1]), (0, -samples % _BLOCK))
-        u = uniform_recurrence(rise, smooth[0] * jnp.exp(x), x, _BLOCK)[:, :samples]
-        return jnp.concatenate([u, jnp.stack([*steps, jnp.roll(Vsc, -self.origin)])])
+        rise = jnp.pad(jnp.diff(drive, prepend=drive[:1]), (0, -drive.size % _BLOCK))
+        return uniform_recurrence(rise, drive[0] * jnp.exp(x), x, _BLOCK)[:, : drive.size]
 
 
 def table_nodes(tau: Float[Array, ""]) -> Float[Array, " nodes"]:
@@ -130,7 +148,7 @@ class Tables(NamedTuple):
     Attributes:
         g, b: estimates of the parameters, around which each table lies (b in s).
         is_possible: whether they could be estimated.
-        smooth: V without its noise (`smooth_drive`), to which the records respond.
+        smooth: V without its noise, to which the records respond.
         decay: decays of an unknown charge at the nodes, in the shared functions.
         coordinates: orthogonal coordinates of the functions, with the inner products over the fitted samples.
     """
@@ -207,7 +225,7 @@ def _multiply_functions(
         v, vsc, sd = record
         g, b, is_possible = _estimate_start(shared, v, vsc)
         nodes = table_nodes(b)
-        smooth, decay = smooth_drive(v, sd), shared.decay @ shared.decay_polynomials(nodes)
+        smooth, decay = shared.smooth_drive(v, sd), shared.decay @ shared.decay_polynomials(nodes)
         used = shared.is_fitted * shared.filter_drive(v, vsc, nodes, smooth)
         return g, b, is_possible, smooth, decay, shared.fitted_functions @ used.T, used @ used.T
 

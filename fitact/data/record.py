@@ -14,6 +14,7 @@ from jaxtyping import Float
 from fitact import charts
 from fitact.compiled import empty_aligned
 from fitact.data.clipping import clipping_mask, replace_codes
+from fitact.data.tones import Tones, find_tones
 from fitact.errors import RATE_OPTION, InputError, channel_option
 from fitact.tables import Display, to_dataframe
 from fitact.units import format_engineering
@@ -124,8 +125,18 @@ class Record(Display):
         """Return the sd of white noise, and that of rounding (see `noise`)."""
         if ("noise", channel) not in self._estimates:
             values = self[channel] if channel == "V" else self[channel][~clipping_mask(self[channel])]
-            self._estimates["noise", channel] = white_noise_sd(values), rounding_noise_sd(values)
+            white, rounding = white_noise_sd(values), rounding_noise_sd(values)
+            if channel == "V" and self.tones is not None:
+                white = math.sqrt(max(float(np.var(values - self.tones.values())) - rounding**2, 0.0))
+            self._estimates["noise", channel] = white, rounding
         return self._estimates["noise", channel]
+
+    @functools.cached_property
+    def tones(self) -> Tones | None:
+        """The few sinusoids of which V consists, or None."""
+        if not is_uniform(self.time):
+            return None
+        return find_tones(self["V"], (self.frequency("V") or math.inf) * self.time_step)
 
     @property
     def leading(self) -> str:

@@ -31,6 +31,7 @@ from fitact.model.force import (
 from fitact.model.response import response
 from fitact.model.response_table import ResponseTable
 from fitact.model.skin import WithSkin
+from fitact.problem.build import smooth_recorded_drive
 from fitact.problem.drive_choice import DriveModel, has_ideal_edges, whole_periods
 from fitact.scene.scene import Scene
 
@@ -272,11 +273,12 @@ def derived_from_fit(
 ) -> DerivedQuantities:
     """Return the derived quantities of a fit, from its first record and drive; `b` is its slowest time constant (s).
 
-    The drive is without its noise if the likelihood responds to it so.
+    The drive is without its noise if the likelihood responds to it so, but as it is at the samples.
     """
     drive, channel = choice.drive, likelihood.channels[0]
     if isinstance(drive, Sampled) and channel.shifts_response and channel.electrical.smooth is not None:
-        drive = dataclasses.replace(drive, samples=channel.electrical.smooth)
+        smooth = smooth_recorded_drive(record) if channel.may_curve_drive else channel.electrical.smooth
+        drive = dataclasses.replace(drive, samples=smooth)
     last = None if isinstance(likelihood.template, WithSkin) else _last_periods(record, drive, b)
     # the peak for a frequency-dependent skin is taken half a step after an ideal jump
     jump_delay = 0.5 * record.time_step if isinstance(likelihood.template, WithSkin) else 0.0

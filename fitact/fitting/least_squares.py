@@ -221,6 +221,10 @@ def _select_nuisances(
     interpolated: tuple[bool, ...],
 ) -> LeastSquaresResult:
     solved = _solve_coloured_noise(likelihood, start, noise, interpolated)
+    if lasting := _find_lasting_charges(solved, optional_nuisances):
+        for index in lasting:
+            likelihood = _free_columns(likelihood, index, "offset")
+        solved = _solve_coloured_noise(likelihood, start, noise, interpolated)
     for _ in range(sum(map(len, optional_nuisances))):
         gains = _bic_decreases(solved, optional_nuisances)
         which, name = max(gains, key=gains.__getitem__, default=(0, ""))
@@ -229,6 +233,24 @@ def _select_nuisances(
         likelihood, theta = _add_nuisance(solved, which, name)
         solved = _solve_coloured_noise(likelihood, theta, solved.sigma, interpolated)
     return solved
+
+
+def _find_lasting_charges(
+    solution: LeastSquaresResult, optional_nuisances: tuple[tuple[str, ...], ...], least: float = 0.5
+) -> list[int]:
+    """Return the channels whose unknown charge lasts for `least` of the record or longer, so that it may be an offset.
+
+    The BIC cannot tell, since a wrong time constant then takes the place of an offset.
+    """
+    likelihood, (offset,) = solution.likelihood, NUISANCES["offset"]
+    slowest = float(np.max(likelihood.evaluate_circuit(solution.theta).tau))
+
+    def lasts(channel: ChannelLikelihood) -> bool:
+        is_alone = channel.linear_sd[FIRST_CHARGE] > 0.0 and channel.linear_sd[offset] == 0.0
+        return bool(is_alone and slowest > least * (channel.samples.time[-1] - channel.samples.time[0]))
+
+    pairs = enumerate(zip(likelihood.channels, optional_nuisances, strict=True))
+    return [i for i, (channel, names) in pairs if "offset" in names and lasts(channel)]
 
 
 def _solve_coloured_noise(
@@ -319,11 +341,16 @@ def _add_nuisance(solution: LeastSquaresResult, index: int, name: str) -> tuple[
         )
         new, before = likelihood.replace_channel(index, channel).names, likelihood.names
         theta = np.array([theta[before.index(n)] if n in before else 0.0 for n in new])
-    else:
-        sd = channel.linear_sd.copy()
-        sd[list(NUISANCES[name])] = 10.0 * np.ptp(channel.samples.observed)
-        channel = dataclasses.replace(channel, linear_sd=sd)
-    return likelihood.replace_channel(index, channel), theta
+        return likelihood.replace_channel(index, channel), theta
+    return _free_columns(likelihood, index, name), theta
+
+
+def _free_columns(likelihood: Likelihood, index: int, name: str) -> Likelihood:
+    """Return the likelihood with a free linear nuisance of channel `index`, whose prior is wide."""
+    channel = likelihood.channels[index]
+    sd = channel.linear_sd.copy()
+    sd[list(NUISANCES[name])] = 10.0 * np.ptp(channel.samples.observed)
+    return likelihood.replace_channel(index, dataclasses.replace(channel, linear_sd=sd))
 
 
 def _bic_decreases(

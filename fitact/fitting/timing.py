@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitact.compiled import jit, pad_rows
+from fitact.compiled import jit, pad_rows, pad_samples
 from fitact.fitting.score_test import explained_squares, orthonormalise
 from fitact.likelihood.certificate import recompress
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import student_weight
 from fitact.likelihood.observable import TIMING_NUISANCES, ChannelInputs
-from fitact.likelihood.smooth_drive import lasting_bend, missing_curve
+from fitact.likelihood.smooth_drive import curve_drive
 from fitact.model.drive import Sampled
 from fitact.model.response import highpass
 from fitact.model.skin import constant_skin_circuit
@@ -123,13 +123,14 @@ def curve_drives(
     for i, (channel, source) in enumerate(zip(likelihood.channels, sources, strict=True)):
         if not channel.may_curve_drive:
             continue
-        electrical, smooth = channel.electrical, smooth_recorded_drive(source.in_time)
+        electrical, record = channel.electrical, source.in_time
+        smooth = smooth_recorded_drive(record)
         drive, now = electrical.drive, np.asarray(electrical.smooth)
         assert isinstance(drive, Sampled)
         assert smooth is not None
         late = theta[likelihood.names.index(channel.qualified_name("delay"))]
         late += float(channel.timing.shift) / float(channel.timing.step)
-        curved = smooth + missing_curve(late) * lasting_bend(smooth)
+        curved = pad_samples(curve_drive(smooth[: len(record)], late, record.tones))
         changes = np.asarray(electrical.noise_gain) * (curved - now) / sigma[i]
         if np.linalg.norm(changes * np.sqrt(channel.samples.weights)) > max_change:
             drive = dataclasses.replace(drive, samples=curved + (np.asarray(drive.samples) - now))

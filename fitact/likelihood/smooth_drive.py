@@ -13,6 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from fitact.compiled import array_module
+from fitact.data.tones import Tones
 
 # 2 S - S^2 of the mean S with the weights 1, 4, 6, 4 and 1 of a cubic B-spline, which leaves a cubic as it is
 _WEIGHTS = np.array([-1.0, -8.0, 4.0, 72.0, 122.0, 72.0, 4.0, -8.0, -1.0]) / 256.0
@@ -49,6 +50,14 @@ def lasting_bend(V: Any) -> Any:
     bend = xp.pad(second_differences(V), 1)
     before, here, after = bend[:-2], bend[1:-1], bend[2:]
     return xp.maximum(xp.minimum(before, after), xp.minimum(xp.maximum(before, after), here))
+
+
+def curve_drive(smooth: Any, late: float, tones: Tones | None) -> Any:
+    """Return a smooth drive (samples, V) between whose samples lines are a curve, where it is `late` (time steps).
+
+    That of a drive of few tones is known; others lack a part of their second differences.
+    """
+    return smooth + missing_curve(late) * lasting_bend(smooth) if tones is None else tones.values_for_lines(late)
 
 
 def missing_curve(late: ArrayLike) -> ArrayLike:

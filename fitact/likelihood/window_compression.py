@@ -12,6 +12,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from jaxtyping import Float
 
+from fitact.data.tones import Tones
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.charge_rows import LAG, ChargeRows, filter_highpass, step_means, whiten_rows
 from fitact.likelihood.compression import (
@@ -32,7 +33,7 @@ from fitact.likelihood.projection import (
     evaluate_baseline,
     factor_products,
 )
-from fitact.likelihood.smooth_drive import lasting_bend, missing_curve, smooth_drive
+from fitact.likelihood.smooth_drive import curve_drive, smooth_drive
 from fitact.model.response_table import count_nodes
 
 REACH = 4.0  # factor by which b may change
@@ -72,6 +73,7 @@ class WindowCompressor:
     # decays in the combinations of the table, and the baseline that each channel has; rows of a current
     shared: tuple[Float[np.ndarray, "functions samples"], ...]
     noise_V: float  # sd of the noise of V, V; 0 if the channels respond to V with its noise
+    tones: Tones | None  # of V in the window of the fit, if they are few
     short: int  # number of the fastest time constants that are not in the tables
     late: float  # delay of Vsc in time steps
 
@@ -83,12 +85,13 @@ class WindowCompressor:
         samples: int,
         step: float,
         noise_V: float,
+        tones: Tones | None,
         late: float,
     ) -> Self:
         """Make the tables around the time constants of a circuit, a factor `REACH` either way.
 
-        `noise_V` is the sd of the noise of V, to which a channel whose response may be delayed does not respond, and
-        `late` the delay of Vsc in time steps.
+        `noise_V` is the sd of the noise of V, to which a channel whose response may be delayed does not respond,
+        `tones` are those of V, and `late` is the delay of Vsc in time steps.
         """
         time, short = step * np.arange(samples), channels[0].count_untabulated(circuit.tau)
         is_single = circuit.tau.size - short == 1
@@ -106,20 +109,20 @@ class WindowCompressor:
             tables.append(table)
             shared.append(functions if each.samples.charges is None else step_means(functions))
         noise = noise_V if any(each.shifts_response for each in channels) else 0.0
-        return cls(tuple(channels), tuple(tables), time, tuple(shared), noise, short, late)
+        return cls(tuple(channels), tuple(tables), time, tuple(shared), noise, tones if noise else None, short, late)
 
     def compress(
         self,
         V: Samples,
         given: Sequence[Samples | MakeRows],
         weights: Sequence[Samples | None],
-        smooth: Samples,
+        drive: tuple[Samples, Samples],
         responses: Float[np.ndarray, "nodes samples"],
         has_charge: bool,
     ) -> tuple[tuple[Compression, ...], tuple[TrendInputs, ...], Compression | None]:
         """Compress a window with the drive `V`: each channel's samples and weights, or rows of charge.
 
-        `smooth` and `responses` are those of `respond`. With `has_charge`, the charge at the first sample is unknown.
+        `drive` and `responses` are those of `respond`. With `has_charge`, the charge at the first sample is unknown.
         Also returns what a trend within the window needs, and the responses at all samples, unless the first channel
         is compressed in them.
         """
@@ -129,10 +132,9 @@ class WindowCompressor:
         np.multiply(late, combined[:TREND_RANK], out=functions[rank:-2])
         functions[-2], found, steps = V, [], np.empty((0, V.size))
         if any(each.shifts_response for each in self.channels):
+            smooth, missed = drive
             # beside its noise, V has what lines between its samples lack
-            number = np.arange(float(V.size))
-            curve = missing_curve(self.late) * np.interp(number - self.late, number, lasting_bend(smooth))
-            steps = drive_steps(smooth, V - smooth + curve, 0, V.size, float(self.time[1]))
+            steps = drive_steps(smooth, V - smooth + missed, 0, V.size, float(self.time[1]))
         for i, pair in enumerate(zip(given, weights, strict=True)):
             functions[-1] = self.tables[i].expected @ responses
             found.append(self._compress_channel(i, late, functions, steps, *pair, has_charge))
@@ -207,13 +209,14 @@ class WindowCompressor:
 
     def respond(
         self, V: Float[np.ndarray, " samples"], start: float, before: FilterState | None
-    ) -> tuple[Samples, Float[np.ndarray, "nodes samples"], FilterState]:
+    ) -> tuple[tuple[Samples, Samples], Float[np.ndarray, "nodes samples"], FilterState]:
         """Return what the channels respond to in the V of a window from `start` (s) on, and the responses at the nodes.
 
-        Also return the state at the end. u[k] = e^{-x} u[k - 1] + phi(x) (V[k] - V[k - 1]). Without a state `before`, V
+        The first is the smooth drive, and what lines between its samples lack where Vsc is late. Also return the state
+        at the end. u[k] = e^{-x} u[k - 1] + phi(x) (V[k] - V[k - 1]). Without a state `before`, V
         was constant before the window.
         """
-        step, smooth = float(self.time[1]), smooth_drive(V, self.noise_V) if self.noise_V else V
+        step, (smooth, missed) = float(self.time[1]), self.smooth_drive(V)
         rise = np.diff(smooth, prepend=smooth[0] if before is None else before.voltage)
         nodes = self.tables[0].nodes
         memory = np.zeros((nodes.size, 1)) if before is None else before.memory
@@ -222,7 +225,20 @@ class WindowCompressor:
             responses[i], left[i] = filter_highpass(rise, x, memory[i])
         length = step * V.size
         age = length + (0.0 if before is None else before.age)
-        return smooth, responses, FilterState(start + length, float(smooth[-1]), left, age)
+        return (smooth, missed), responses, FilterState(start + length, float(smooth[-1]), left, age)
+
+    def smooth_drive(self, V: Samples) -> tuple[Samples, Samples]:
+        """Return the drive of a window without most of its noise, unless the channels respond to that.
+
+        Also what lines between its samples lack, where Vsc is late.
+        """
+        tones = self.tones and self.tones.continue_with(V)
+        if tones is not None:
+            smooth = tones.values()
+        else:
+            smooth = smooth_drive(V, self.noise_V) if self.noise_V else V
+        number = np.arange(float(V.size))
+        return smooth, np.interp(number - self.late, number, curve_drive(smooth, self.late, tones) - smooth)
 
 
 class WindowProducts(NamedTuple):

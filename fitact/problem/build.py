@@ -390,6 +390,8 @@ def _can_smooth(choice: DriveModel, template: Circuit) -> bool:
 
 def smooth_recorded_drive(record: Record) -> Float[np.ndarray, " samples"] | None:
     """Return V as a delay shifts it; None if it has no noise."""
+    if record.tones is not None:
+        return pad_samples(record.tones.values())
     noise = record.noise("V")
     return pad_samples(smooth_drive(record["V"], noise)) if noise else None
 

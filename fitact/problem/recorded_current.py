@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float
 from fitact.compiled import pad_samples
 from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
+from fitact.data.tones import Tones
 from fitact.errors import InputError
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.charge_rows import LAG, ROW_NOISE, ChargeRows, RowCovariance, step_means, whiten_rows
@@ -74,6 +75,7 @@ class RecordedCurrent:
     jumps: Jumps  # of I
     rounded: RoundedSteps  # of I
     excluded: Bool[np.ndarray, " samples"]  # samples of I that are clipped
+    tones: Tones | None  # of V
 
     @classmethod
     def from_record(cls, record: Record) -> "RecordedCurrent":
@@ -93,10 +95,11 @@ class RecordedCurrent:
         rounding = rounding_noise_sd(V)
         # within runs of a coarse V, of ten bits or fewer, less noise than this is not known
         least = 0.1 * rounding if rounding > 5e-4 * float(np.ptp(V)) else 0.0
-        noise_V = math.sqrt(max(estimate_noise(V) ** 2 - rounding**2, least**2)), rounding
+        noise = estimate_noise(V) if record.tones is None else record.noise("V")
+        noise_V = math.sqrt(max(noise**2 - rounding**2, least**2)), rounding
         step_I = least_step(current)
         noise_I = max(estimate_noise(current), step_I / math.sqrt(12.0))
-        return cls.from_samples(V, current, record.time_step, noise_V, noise_I, step_I)
+        return cls.from_samples(V, current, record.time_step, noise_V, noise_I, step_I, record.tones)
 
     @classmethod
     def from_samples(
@@ -107,6 +110,7 @@ class RecordedCurrent:
         noise_V: tuple[float, float],
         noise: float,
         step_I: float,
+        tones: Tones | None,
         is_whole: bool = True,
     ) -> "RecordedCurrent":
         """Estimate which samples are less certain than the noise (V, A) and the step of the converter of I make them.
@@ -122,17 +126,18 @@ class RecordedCurrent:
         )
         excluded = np.zeros(V.size, bool) if is_rounded else clipping_mask(current)
         variance_V = drive_variance(V, *noise_V)
-        return cls(V, rounded.values, step, variance_V, noise_V, noise, step_I, jumps, rounded, excluded)
+        return cls(V, rounded.values, step, variance_V, noise_V, noise, step_I, jumps, rounded, excluded, tones)
 
     def continue_with(self, V: Rows, current: Rows) -> "RecordedCurrent":
         """Return other samples of V and I, with the same noise."""
         noise = self.noise_V, self.noise_I, least_step(current)
-        return self.from_samples(V, current, self.step, *noise, is_whole=False)
+        tones = self.tones and self.tones.continue_with(V)
+        return self.from_samples(V, current, self.step, *noise, tones, is_whole=False)
 
     @functools.cached_property
     def smooth(self) -> Rows:
         """V without its noise, before any fit."""
-        return smooth_drive(self.V, math.hypot(*self.noise_V))
+        return smooth_drive(self.V, math.hypot(*self.noise_V)) if self.tones is None else self.tones.values()
 
     @functools.cached_property
     def bend(self) -> Rows:

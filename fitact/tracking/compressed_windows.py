@@ -18,7 +18,7 @@ from fitact.fitting.fit import fit
 from fitact.fitting.result import Fit
 from fitact.likelihood.certificate import TOLERANCE, reason_against_table
 from fitact.likelihood.compression import Compression
-from fitact.likelihood.likelihood import CircuitValues
+from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.window_compression import FilterState, MakeRows, TrendInputs, WindowCompressor
 from fitact.model.circuit import passes_direct_current
 from fitact.problem.recorded_current import Current, RecordedCurrent
@@ -72,7 +72,7 @@ class WindowResponses(NamedTuple):
     """A window with what its compression needs; without responses where it has lost samples or no drive."""
 
     window: Window
-    drive: Float[np.ndarray, " samples"] | None  # V as the channels respond to it
+    drive: tuple[np.ndarray, np.ndarray] | None  # V as the channels respond to it; see `WindowCompressor.respond`
     responses: Float[np.ndarray, "nodes samples"] | None
     recorded: list[np.ndarray | MakeRows]  # of each channel
     weights: list[np.ndarray | None]  # of its samples, or None where all are 1
@@ -86,6 +86,7 @@ class WindowModel(NamedTuple):
     """Model of all windows, from a fit to one of them."""
 
     fit: Fit
+    likelihood: Likelihood  # with the noise of V that its circuit has
     compressor: WindowCompressor
     parts: int  # parts of a window in which the signal is compared
     drive_rms: float  # V
@@ -112,7 +113,7 @@ class WindowModel(NamedTuple):
                 state = None
             has_charge = state is None or state.age < settled
             drive, responses, state = self.compressor.respond(V, window.start, state)
-            channels = self.fit.likelihood.channels
+            channels = self.likelihood.channels
             samples = [window.channels[channel.channel] for channel in channels]
             clipped = [clipping_mask(values) for values in samples]
             weights = [np.where(each, 0.0, 1.0) if each.any() else None for each in clipped]
@@ -195,12 +196,24 @@ def find_model(windows: Sequence[Window], scene: Scene, step: float, source: str
     fitted = fit(record, scene)
     with double_precision():
         circuit = fitted.likelihood.evaluate_circuit(fitted.theta)
-        fitted_channels, noise_V = fitted.likelihood.channels, record.noise("V")
+        likelihood, noise_V = _set_noise_gains(fitted.likelihood, circuit), record.noise("V")
         late = fitted.likelihood.to_physical(fitted.theta).get("delay", 0.0) / step
-        compressor = WindowCompressor.from_channels(fitted_channels, circuit, time.size, step, noise_V, float(late))
+        compressor = WindowCompressor.from_channels(
+            likelihood.channels, circuit, time.size, step, noise_V, record.tones, float(late)
+        )
     parts = max(1, math.floor((time[-1] + step) * frequency))
     current = _describe_current(fitted, record, circuit)
-    return WindowModel(fitted, compressor, parts, float(np.std(first.channels["V"])), current, circuit.tau)
+    return WindowModel(fitted, likelihood, compressor, parts, float(np.std(first.channels["V"])), current, circuit.tau)
+
+
+def _set_noise_gains(likelihood: Likelihood, circuit: CircuitValues) -> Likelihood:
+    """Return the likelihood in which the noise of V has the gain of the fitted circuit, and not of the fit's start."""
+    for i, channel in enumerate(likelihood.channels):
+        if channel.shifts_response:
+            gain = circuit.terms[channel.channel].gain_in_step(float(channel.timing.step))
+            channel = channel.replace_observable(noise_gain=np.asarray(gain, dtype=float))
+            likelihood = likelihood.replace_channel(i, channel)
+    return likelihood
 
 
 def _describe_current(fitted: Fit, record: Record, circuit: CircuitValues) -> tuple[RecordedCurrent, Current] | None:
@@ -229,7 +242,7 @@ def require_compressible(scene: Scene, source: str) -> None:
 
 def require_table(model: WindowModel, source: str) -> None:
     """Refuse a circuit whose responses have no table, so that windows cannot be compressed."""
-    likelihood = model.fit.likelihood
+    likelihood = model.likelihood
     circuit = likelihood.evaluate_circuit(model.fit.theta)
     reasons = [reason_against_table(each, circuit, TOLERANCE) for each in likelihood.channels]
     if any(each.samples.charges is None and each.samples.has_drive_noise for each in likelihood.channels):

@@ -29,7 +29,7 @@ def solve_windows(
     model: WindowModel, windows: CompressedWindows, *, rates: Sequence[float] | None = None, max_rounds: int = 10
 ) -> Track:
     """Join windows by random walks; `rates` (per root of a second, as in `WALKS`) replaces their estimates."""
-    fitted, likelihood = model.fit, model.fit.likelihood.without_samples()
+    fitted, likelihood = model.fit, model.likelihood.without_samples()
     names = likelihood.names
     walking = tuple(name for name in names if name in FINGER_PARAMETERS)
     order = [names.index(name) for name in (*walking, *(name for name in names if name not in walking))]
@@ -205,7 +205,7 @@ def _make_track(
     average: TimeAverage | None,
     follows: bool,
 ) -> Track:
-    fitted, likelihood, scene = model.fit, model.fit.likelihood, model.fit.scene
+    fitted, likelihood, scene = model.fit, model.likelihood, model.fit.scene
     theta, covariance = state
     names, contact = likelihood.names, windows.contact
     time = windows.start + 0.5 * length

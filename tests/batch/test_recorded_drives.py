@@ -157,6 +157,9 @@ def test_drives_that_curve_between_samples_are_curved_in_batches():
     assert accepted(records, scene).all()
     rows = fitact.fit_many(records, scene, progress=False)
     alone = fitact.fit(records[5], scene)
+    assert rows[5]["force_peak"] == pytest.approx(alone.derived()["force_peak"]["q50"], rel=1e-5)
+    tones = slow_record(0, 3, 0.02, waveform="tones")  # which a fit knows between samples
+    assert not RecordGroup(tones.time, members=[(i, tones) for i in range(16)]).is_batchable(scene)
     truth = {"g": SKIN[2] / (2.0 * SKIN[2] + SKIN[1]), "b": SKIN[0] * (2.0 * SKIN[2] + SKIN[1])}
     for name, value in truth.items():
         off = np.array([np.log(row[name] / value) / row[f"{name}_log_sd"] for row in rows])
@@ -165,8 +168,21 @@ def test_drives_that_curve_between_samples_are_curved_in_batches():
         assert np.log(rows[5][name] / alone.derived()[name]["q50"]) == pytest.approx(
             0.0, abs=0.1 * rows[5][f"{name}_log_sd"]
         )
-    tones = slow_record(0, 3, 0.02, waveform="tones")  # whose force would be wrong
-    assert not RecordGroup(tones.time, members=[(i, tones) for i in range(16)]).is_batchable(scene)
+
+
+def test_a_noisy_sine_is_smoothed_in_batches_as_alone():
+    """Wavelets left noise of the sine, by which b seemed twice as certain."""
+    scene = fitact.Scene.from_dict({"drive": {"waveform": "measured"}, "prior": {"Ci": {"relative_sd": 0.1}}})
+    records = [slow_record(seed, 3, 2.0, bits=14, waveform="sine") for seed in range(16)]
+    assert accepted(records, scene).all()
+    rows = fitact.fit_many(records, scene, progress=False)
+    for k in (0, 5):
+        alone = fitact.fit(records[k], scene).derived()
+        for name in ("g", "b"):
+            assert rows[k][f"{name}_log_sd"] == pytest.approx(alone[name]["u"], rel=0.01)
+            assert np.log(rows[k][name] / alone[name]["q50"]) == pytest.approx(0.0, abs=0.1 * alone[name]["u"])
+        for name in ("force_mean", "force_peak"):
+            assert rows[k][name] == pytest.approx(alone[name]["q50"], rel=5e-4)
 
 
 def test_records_of_different_skew_are_fitted_together_within_a_step():

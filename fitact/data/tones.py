@@ -1,0 +1,145 @@
+"""A recorded signal that is a mean and a few sinusoids, beside white noise: one sine, or a carrier that is modulated.
+
+Its few parameters are known far better than a sample. A smooth curve through a noisy sine still contains noise at all
+frequencies up to some tens of hertz beyond it, which is mistaken for information on a delay.
+"""
+
+from typing import NamedTuple, Self
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+_MAX_TONES = 8
+_SOME = 1 << 16  # samples in which tones are first sought
+_CYCLES = 8  # in these samples, above which their spectrum tells tones from the mean
+_WINDOW = (0.35875, -0.48829, 0.14128, -0.01168)  # Blackman and Harris (Proc. IEEE 66 (1978) 51), side lobes of -92 dB
+_MAX_DISTORTION = 0.03  # by weak tones that the spectrum hides; an edge has many
+_BLOCK = 32  # samples, whose mean shows what is slower than noise
+_LOBE = 4.0  # half width of its main lobe, in cycles per record
+
+Samples = Float[np.ndarray, " samples"]
+
+
+class Tones(NamedTuple):
+    """Mean and sinusoids Re(A e^{j w (k - middle)}) at the samples k."""
+
+    mean: float
+    phasors: Complex[np.ndarray, " tones"]  # A
+    frequencies: Float[np.ndarray, " tones"]  # w, rad per sample
+    size: int  # number of samples
+
+    @classmethod
+    def from_samples(cls, values: Samples, frequencies: Float[np.ndarray, " tones"], rounds: int = 8) -> Self:
+        """Fit all parameters by least squares; `frequencies` are a start, better than half a cycle per record."""
+        tones, count = cls(0.0, np.zeros(frequencies.size, complex), frequencies, values.size), frequencies.size
+        for _ in range(rounds):
+            products = np.zeros(2 * [2 + 3 * count])
+            for first in range(0, values.size, _SOME):
+                last = min(first + _SOME, values.size)
+                waves = tones._waves(first, last)
+                since = (np.arange(first, last) - tones._middle) / values.size
+                slopes = since * (1j * tones.phasors[:, None] * waves).real
+                rows = np.vstack([np.ones(last - first), waves.real, -waves.imag, slopes, values[first:last]])
+                products += rows @ rows.T
+            linear = slice(1 + 2 * count)
+            mean, *parts = np.linalg.lstsq(products[linear, linear], products[linear, -1])[0]
+            phasors = np.array(parts[:count]) + 1j * np.array(parts[count:])
+            if np.array_equal(tones.phasors, np.zeros(count)):  # whose frequencies have no slopes yet
+                tones = tones._replace(mean=float(mean), phasors=phasors)
+                continue
+            change = np.linalg.lstsq(products[:-1, :-1], products[:-1, -1])[0][-count:]
+            tones = cls(float(mean), phasors, tones.frequencies + change / values.size, values.size)
+            if np.max(np.abs(change)) < 1e-5:
+                break
+        return tones
+
+    def continue_with(self, values: Samples) -> Self | None:
+        """Return the tones of other samples of the signal, or None if they are not the same."""
+        tones = self.from_samples(values, self.frequencies)
+        return tones if _is_noise(values - tones.values(), values) else None
+
+    def values(self) -> Samples:
+        """Return the signal at the samples."""
+        return self._sum(self.phasors)
+
+    def values_for_lines(self, late: float) -> Samples:
+        """Return samples between which lines are the signal, where it is read `late` (in samples)."""
+        part = late % 1.0
+        back = np.exp(-1j * self.frequencies)
+        return self._sum(self.phasors * back**part / (1.0 - part + part * back))
+
+    def basis(self) -> Float[np.ndarray, "functions samples"]:
+        """Return orthonormal functions of which the signal consists."""
+        waves = self._waves(0, self.size)
+        return np.linalg.qr(np.vstack([np.ones(self.size), waves.real, waves.imag]).T)[0].T
+
+    def _sum(self, phasors: Complex[np.ndarray, " tones"]) -> Samples:
+        parts = (slice(first, min(first + _SOME, self.size)) for first in range(0, self.size, _SOME))
+        return self.mean + np.concatenate([(phasors @ self._waves(part.start, part.stop)).real for part in parts])
+
+    @property
+    def _middle(self) -> float:
+        return 0.5 * (self.size - 1)
+
+    def _waves(self, first: int, last: int) -> Complex[np.ndarray, "tones some"]:
+        return np.exp(1j * self.frequencies[:, None] * (np.arange(first, last) - self._middle))
+
+
+def find_tones(values: Samples, frequency: float) -> Tones | None:
+    """Return the few tones of which a signal consists, or None if more remains than white noise and rounding.
+
+    `frequency` is that with which it repeats (cycles per sample), or infinite.
+    """
+    size = some = min(values.size, _SOME)
+    found, height = _find_lines(values[:some] - values[:some].mean())
+    if not found.size and frequency * some < _CYCLES:
+        found, height = np.array([2.0 * np.pi * frequency]), np.ones(1)
+    if np.count_nonzero(height > 1e-3) > _MAX_TONES:
+        return None
+    found = found[height > _MAX_DISTORTION]
+    while 0 < found.size <= _MAX_TONES:
+        tones = Tones.from_samples(values[:size], found)
+        found, rest = tones.frequencies, values[:size] - tones.values()
+        if not _is_noise(rest, values[:size]):
+            added, height = _find_lines(rest[:_SOME])
+            cycle, is_carrier = 2.0 * np.pi / size, np.min(found) > 2.0 * np.pi * _CYCLES / some
+            apart = np.abs(added[:, None] - found).min(axis=1, initial=np.inf) > cycle
+            apart &= height > 0.05
+            is_small = is_carrier or np.std(rest) < _MAX_DISTORTION * np.std(values[:size])
+            if size > some or not apart.any() or not is_small:
+                return None
+            found = np.append(found, added[apart])
+        elif size == values.size:
+            return tones
+        else:
+            size = min(4 * size, values.size)
+    return None
+
+
+def _is_noise(rest: Samples, values: Samples) -> bool:
+    """Return whether the rest of a signal is white noise: neighbours differ as much as all, and means hardly.
+
+    The rounding of the values may be the same for some samples.
+    """
+    white = float(np.std(np.diff(rest, 3))) / np.sqrt(20.0)
+    rounding = float(np.min(np.diff(np.unique(values[:_SOME])), initial=np.inf)) / np.sqrt(12.0)
+    means = rest[: rest.size // _BLOCK * _BLOCK].reshape(-1, _BLOCK).mean(axis=1)
+    is_alike = np.std(rest) < 1.5 * max(white, rounding)
+    return bool(is_alike and np.std(means) < max(2.0 * white / np.sqrt(_BLOCK), rounding))
+
+
+def _find_lines(values: Samples) -> tuple[Float[np.ndarray, " lines"], Float[np.ndarray, " lines"]]:
+    """Return the frequencies (rad per sample) of the lines of a spectrum, and their heights relative to the largest.
+
+    They are above its noise and the side lobes. There are none if the largest may be a part of the mean.
+    """
+    angles, lobe = 2.0 * np.pi * np.arange(values.size) / values.size, round(2 * _LOBE)
+    window = sum(weight * np.cos(i * angles) for i, weight in enumerate(_WINDOW))
+    size = np.abs(np.fft.rfft(window * values, 2 * values.size))
+    if np.argmax(size) < 2 * lobe:
+        return np.empty(0), np.empty(0)
+    middle, floor = size[1:-1], max(5e-5 * float(size.max()), 6.0 * float(np.median(size)))
+    is_line = (middle > size[:-2]) & (middle >= size[2:]) & (middle > floor)
+    is_line[: lobe - 1] = False
+    lines = np.flatnonzero(is_line) + 1
+    return lines * np.pi / values.size, size[lines] / size.max()

@@ -1,0 +1,91 @@
+"""Recorded drives of few sinusoids in noise and rounding, against the sinusoids of which they were made."""
+
+import numpy as np
+import pytest
+import scipy.signal
+
+import fitact
+from fitact.data.tones import find_tones
+
+# amplitude (V) and frequency (cycles per sample) of each tone
+DRIVES = {
+    "sine": [(100.0, 1 / 1000)],
+    "two and a half periods": [(100.0, 1 / 2400)],
+    "distorted": [(100.0, 1 / 1000), (1.0, 2 / 1000), (0.5, 3 / 1000)],
+    "carrier": [(50.0, 0.1), (25.0, 0.1007), (25.0, 0.0993)],
+    "two tones": [(90.0, 1 / 1600), (90.0, 41 / 1600)],
+}
+
+
+def record_tones(name: str, bits: int, noise: float, samples: int = 6000) -> tuple[np.ndarray, np.ndarray]:
+    """Return V as recorded, and without noise and rounding."""
+    rng, k = np.random.default_rng(0), np.arange(samples)
+    V = sum((a * np.sin(2.0 * np.pi * f * k + rng.uniform(0.0, 6.0)) for a, f in DRIVES[name]), 0.3 * np.ones(samples))
+    noisy = V + noise * rng.standard_normal(samples)
+    step = 260.0 / 2**bits
+    return step * np.round(noisy / step), V
+
+
+@pytest.mark.parametrize("bits", [8, 14])
+@pytest.mark.parametrize("name", list(DRIVES))
+def test_tones_are_as_certain_as_noise_allows(name: str, bits: int):
+    recorded, V = record_tones(name, bits, 0.2)
+    tones = find_tones(recorded, min(f for _, f in DRIVES[name]))
+    assert tones is not None
+    assert len(tones.frequencies) == len(DRIVES[name])
+    parameters, error = 1 + 3 * len(DRIVES[name]), np.std(recorded - V)
+    # least squares with p parameters has an error of sd sqrt(p / n) of the noise (2.5: 1 of 10^6 for four parameters)
+    assert np.sqrt(np.mean((tones.values() - V) ** 2)) < 2.5 * error * np.sqrt(parameters / V.size)
+    basis = tones.basis()
+    np.testing.assert_allclose(basis @ basis.T, np.eye(len(basis)), atol=1e-12)
+    np.testing.assert_allclose((basis @ tones.values()) @ basis, tones.values(), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["sine", "carrier"])
+def test_the_noise_of_a_carrier_is_that_beside_it(name: str):
+    """Third differences took a carrier of ten samples per period for noise: 20 times too much."""
+    recorded, V = record_tones(name, 12, 0.2)
+    time = 1e-5 * np.arange(V.size)
+    found = fitact.Record.from_arrays(time, V=recorded, Vsc=0.1 * recorded).noise("V")
+    assert found == pytest.approx(np.std(recorded - V), rel=0.03)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.3, -1.4, 2.5])
+def test_lines_between_samples_are_the_tones(late: float):
+    tones = find_tones(record_tones("carrier", 14, 0.01)[0], np.inf)
+    assert tones is not None
+    k, middle = np.arange(tones.size), 0.5 * (tones.size - 1)
+    angles = tones.frequencies[:, None] * (k - late - middle)
+    exact = tones.mean + (tones.phasors[:, None] * np.exp(1j * angles)).real.sum(axis=0)
+    read = np.interp(k - late, k, tones.values_for_lines(late))
+    np.testing.assert_allclose(read[3:-3], exact[3:-3], atol=1e-9)
+
+
+def test_tones_of_other_samples():
+    recorded, V = record_tones("carrier", 12, 0.2)
+    tones = find_tones(recorded[:3000], np.inf)
+    assert tones is not None
+    later = tones.continue_with(recorded[3000:5000])
+    assert later is not None
+    np.testing.assert_allclose(later.values(), V[3000:5000], atol=0.05)
+    changed = np.where(np.arange(2000) < 1000, recorded[3000:5000], 0.5 * recorded[3000:5000])
+    assert tones.continue_with(changed) is None
+
+
+@pytest.mark.parametrize("periods", [2.3, 6.4, 60.0])
+def test_other_drives_have_no_tones(periods: float):
+    k, rng = np.arange(6000), np.random.default_rng(1)
+    turns = 2.0 * np.pi * periods * k / k.size
+    sine = 100.0 * np.sin(turns)
+    pole = np.exp(-1.0 / 30.0)
+    drives = {
+        "square": 100.0 * scipy.signal.square(turns),
+        "slewed": scipy.signal.lfilter([1.0 - pole], [1.0, -pole], 100.0 * scipy.signal.square(turns)),
+        "triangle": 100.0 * scipy.signal.sawtooth(turns, 0.5),
+        "chirp": 100.0 * scipy.signal.chirp(k / k.size, periods, 1.0, 3.0 * periods),
+        "burst": np.where(k < 4000, sine, 0.0),
+        "a sine that grows": sine * (1.0 + 0.02 * (k / k.size) ** 2),
+        "a sine that sticks": np.where(abs(k - 3000) < 60, sine[2940], sine),
+    }
+    for name, V in drives.items():
+        assert find_tones(V + 0.1 * rng.standard_normal(k.size), periods / k.size) is None, name
