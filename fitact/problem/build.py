@@ -365,7 +365,7 @@ def _make_charge_rows(
         # a record too short to show one hum cannot tell that of 60 Hz from that of 50 Hz either
         if frequency % 50.0 == 0.0 and frequency not in hum:
             linear_sd[2 * i + 2 : 2 * i + 4] = min(10.0 * current.noise_I, usual_hum)
-    modelled = Current(estimate.capacitance + stray, estimate.weight, 0.0)
+    modelled = Current(estimate.capacitance + stray, estimate.weight, current.start_delay)
     rows, V = current.make_rows(modelled, respond_to(current, estimate, stray), nuisances)
     timing = dataclasses.replace(channel.timing, free=("delay",))
     # a resistance that limits I for a part of a step only makes it later
@@ -380,7 +380,7 @@ def _make_charge_rows(
         noise_floor=np.asarray(current.noise_I * (1.0 if current.is_coarse else 0.5)),
     )
     usable = (lags > 0 or not limits_current(bare.template)) and not passes_direct_current(bare.template)
-    return set_rows(channel, rows, V, 0.0), estimate if usable else None, hum
+    return set_rows(channel, rows, V, current.start_delay * record.time_step), estimate if usable else None, hum
 
 
 def _can_smooth(choice: DriveModel, template: Circuit) -> bool:

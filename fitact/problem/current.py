@@ -118,8 +118,8 @@ def _scan_recorded(
     several = math.ceil((current.I.size - 3 * LAG) / most)
     first, count = 2 * LAG, (current.I.size - 2 * LAG) // several
     step = current.step * several
-    lost = thin_rows(current.excluded_rows(0.0) * 1.0, several) > 0.0
-    (means, uncertain), rounded = current.step_means(Current(C, 0.0, 0.0)), current.rounded
+    lost = thin_rows(current.excluded_rows(current.start_delay) * 1.0, several) > 0.0
+    (means, uncertain), rounded = current.step_means(Current(C, 0.0, current.start_delay)), current.rounded
     common = np.roll(rounded.variance * rounded.alike * run_lengths(rounded.group), LAG)
     own = current.noise_I**2 / several + thin_rows(uncertain * current.jumps.alike + common, several) / several
     own += 1e-24 * float(np.ptp(current.I)) ** 2

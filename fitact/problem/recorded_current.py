@@ -23,7 +23,7 @@ from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
 from fitact.data.tones import Tones
 from fitact.errors import InputError
 from fitact.likelihood.channel import ChannelLikelihood
-from fitact.likelihood.charge_rows import LAG, ROW_NOISE, ChargeRows, RowCovariance, step_means, whiten_rows
+from fitact.likelihood.charge_rows import LAG, MAX_STEPS, ROW_NOISE, ChargeRows, RowCovariance, step_means, whiten_rows
 from fitact.likelihood.observable import ChannelInputs
 from fitact.likelihood.smooth_drive import lasting_bend, second_differences, smooth_drive
 from fitact.model.circuit import gain_at
@@ -148,6 +148,19 @@ class RecordedCurrent:
     def lasting_bend(self) -> Rows:
         """Second differences without those of single corners, V."""
         return lasting_bend(self.smooth)
+
+    @functools.cached_property
+    def start_delay(self) -> float:
+        """Delay of I in time steps, from which a fit starts: that of a carrier, whose current follows dV/dt; else 0."""
+        if self.tones is None:
+            return 0.0
+        largest = int(np.argmax(np.abs(self.tones.phasors)))
+        frequency = self.tones.frequencies[largest]
+        if frequency * MAX_STEPS < 0.3:  # rad; the rows of a delay that is far off are still about right
+            return 0.0
+        phasors = self.tones.from_samples(self.I, self.tones.frequencies, rounds=1).phasors
+        phase = np.angle(phasors[largest] / (1j * self.tones.phasors[largest]))
+        return float(np.clip(-phase / frequency, -MAX_STEPS, MAX_STEPS))
 
     @property
     def is_coarse(self) -> bool:
