@@ -58,6 +58,18 @@ class Tones(NamedTuple):
         tones = self.from_samples(values, self.frequencies)
         return tones if _is_noise(values - tones.values(), values) else None
 
+    def carrier_gain(self, values: Samples) -> tuple[complex, float] | None:
+        """Return the gain of other samples over the strongest tone, and its frequency (rad per sample).
+
+        None unless it is so fast that a delay by some samples matters more than the phase of a finger.
+        """
+        strongest = int(np.argmax(np.abs(self.phasors)))
+        frequency = float(self.frequencies[strongest])
+        if frequency < 0.1:
+            return None
+        phasors = self.from_samples(values, self.frequencies, rounds=1).phasors
+        return complex(phasors[strongest] / self.phasors[strongest]), frequency
+
     def values(self) -> Samples:
         """Return the signal at the samples."""
         return self._sum(self.phasors)

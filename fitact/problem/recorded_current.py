@@ -152,15 +152,11 @@ class RecordedCurrent:
     @functools.cached_property
     def start_delay(self) -> float:
         """Delay of I in time steps, from which a fit starts: that of a carrier, whose current follows dV/dt; else 0."""
-        if self.tones is None:
+        found = self.tones and self.tones.carrier_gain(self.I)
+        if found is None:
             return 0.0
-        largest = int(np.argmax(np.abs(self.tones.phasors)))
-        frequency = self.tones.frequencies[largest]
-        if frequency * MAX_STEPS < 0.3:  # rad; the rows of a delay that is far off are still about right
-            return 0.0
-        phasors = self.tones.from_samples(self.I, self.tones.frequencies, rounds=1).phasors
-        phase = np.angle(phasors[largest] / (1j * self.tones.phasors[largest]))
-        return float(np.clip(-phase / frequency, -MAX_STEPS, MAX_STEPS))
+        gain, frequency = found
+        return float(np.clip(-np.angle(gain / 1j) / frequency, -MAX_STEPS, MAX_STEPS))
 
     @property
     def is_coarse(self) -> bool:

@@ -49,7 +49,8 @@ def estimate_from_vsc(
 ) -> VscEstimate:
     """Estimate g and b from Vsc = g V - (1/b) ∫ Vsc dt + line, the circuit's equation integrated once.
 
-    With a leak, (d/b) ∫ V dt with the gain d at zero frequency takes the place of the line's slope.
+    With a leak, (d/b) ∫ V dt with the gain d at zero frequency takes the place of the line's slope. A carrier tells g,
+    and hardly b, for which its delay would be mistaken.
 
     Raises:
         InputError: g is not between 0 and `max_divider` (1/2, or slightly more with a free gain), which this circuit
@@ -71,6 +72,8 @@ def estimate_from_vsc(
         rows = np.stack([voltage[part], integral[part], ones, line[part], vsc[part]], axis=1)
         R = np.asarray(np.linalg.qr(np.vstack([R, rows[inside[part]]]), mode="r"))
     (g, slope, _, direct), *_ = np.linalg.lstsq(R[:, :4], R[:, 4], rcond=None)
+    if choice.name == "measured" and record.tones is not None and (found := record.tones.carrier_gain(vsc)):
+        g, slope = abs(found[0]), 0.0
     if g >= max_divider:
         raise InputError(
             f"{record.source}: Vsc is {g:.3g} times V at a step, but this circuit excludes 1/2 or more;"
