@@ -23,7 +23,16 @@ from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
 from fitact.data.tones import Tones
 from fitact.errors import InputError
 from fitact.likelihood.channel import ChannelLikelihood
-from fitact.likelihood.charge_rows import LAG, MAX_STEPS, ROW_NOISE, ChargeRows, RowCovariance, step_means, whiten_rows
+from fitact.likelihood.charge_rows import (
+    LAG,
+    MAX_STEPS,
+    ROW_NOISE,
+    ChargeRows,
+    RowCovariance,
+    mean_filter,
+    step_means,
+    whiten_rows,
+)
 from fitact.likelihood.observable import ChannelInputs
 from fitact.likelihood.smooth_drive import lasting_bend, second_differences, smooth_drive
 from fitact.model.circuit import gain_at
@@ -221,8 +230,17 @@ class RecordedCurrent:
     def step_means(self, modelled: Current) -> tuple[Rows, Rows]:
         """Return the rows of the mean current over each step, and their variance beyond that of noise, A^2."""
         means, variance = self.jumps.step_means(self.I, modelled.delay, self.noise_I)
+        means *= self._carrier_correction(modelled.delay)
         kink = modelled.conductance * self.step / max(modelled.capacitance, 1e-15)  # of what does not follow dV/dt
         return means, variance + self.jumps.kink_variance(self.I.size) * kink**2
+
+    def _carrier_correction(self, delay: float) -> float:
+        """Return the mean of a carrier over a step, over that by `step_means`: 1.0003 for ten samples in a period."""
+        found = self.tones and self.tones.carrier_gain(self.I)
+        if found is None:
+            return 1.0
+        taps, _ = mean_filter(delay)
+        return float(np.sinc(found[1] / (2.0 * math.pi)) / abs(np.exp(-1j * found[1] * np.arange(taps.size)) @ taps))
 
     def rise(self, V: Rows) -> Rows:
         """Return the rise of a drive over each step, V/s, stored as rows are."""
