@@ -9,13 +9,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from jaxtyping import Complex, Float
 
-_MAX_TONES = 8
 _SOME = 1 << 16  # samples in which tones are first sought
-_CYCLES = 8  # in these samples, above which their spectrum tells tones from the mean
-_WINDOW = (0.35875, -0.48829, 0.14128, -0.01168)  # Blackman and Harris (Proc. IEEE 66 (1978) 51), side lobes of -92 dB
-_MAX_DISTORTION = 0.03  # by weak tones that the spectrum hides; an edge has many
-_BLOCK = 32  # samples, whose mean shows what is slower than noise
-_LOBE = 4.0  # half width of its main lobe, in cycles per record
 
 Samples = Float[np.ndarray, " samples"]
 
@@ -58,17 +52,16 @@ class Tones(NamedTuple):
         tones = self.from_samples(values, self.frequencies)
         return tones if _is_noise(values - tones.values(), values) else None
 
-    def carrier_gain(self, values: Samples) -> tuple[complex, float] | None:
-        """Return the gain of other samples over the strongest tone, and its frequency (rad per sample).
+    @property
+    def carrier(self) -> float | None:
+        """Frequency of the strongest tone (rad per sample), if a delay changes its phase more than a finger does."""
+        frequency = float(self.frequencies[self._strongest])
+        return frequency if frequency > 0.1 else None
 
-        None unless it is so fast that a delay by some samples matters more than the phase of a finger.
-        """
-        strongest = int(np.argmax(np.abs(self.phasors)))
-        frequency = float(self.frequencies[strongest])
-        if frequency < 0.1:
-            return None
+    def carrier_gain(self, values: Samples) -> complex:
+        """Return the gain of other samples over the strongest tone."""
         phasors = self.from_samples(values, self.frequencies, rounds=1).phasors
-        return complex(phasors[strongest] / self.phasors[strongest]), frequency
+        return complex(phasors[self._strongest] / self.phasors[self._strongest])
 
     def values(self) -> Samples:
         """Return the signal at the samples."""
@@ -90,6 +83,10 @@ class Tones(NamedTuple):
         return self.mean + np.concatenate([(phasors @ self._waves(part.start, part.stop)).real for part in parts])
 
     @property
+    def _strongest(self) -> int:
+        return int(np.argmax(np.abs(self.phasors)))
+
+    @property
     def _middle(self) -> float:
         return 0.5 * (self.size - 1)
 
@@ -97,27 +94,31 @@ class Tones(NamedTuple):
         return np.exp(1j * self.frequencies[:, None] * (np.arange(first, last) - self._middle))
 
 
-def find_tones(values: Samples, frequency: float) -> Tones | None:
+def find_tones(
+    values: Samples, frequency: float, max_tones: int = 8, cycles: float = 8.0, max_distortion: float = 0.03
+) -> Tones | None:
     """Return the few tones of which a signal consists, or None if more remains than white noise and rounding.
 
-    `frequency` is that with which it repeats (cycles per sample), or infinite.
+    `frequency` is that with which it repeats (cycles per sample), or infinite. Below a number of `cycles`, a spectrum
+    does not tell a tone from the mean. It hides tones up to `max_distortion` of the others, which are added; an edge
+    has many.
     """
     size = some = min(values.size, _SOME)
     found, height = _find_lines(values[:some] - values[:some].mean())
-    if not found.size and frequency * some < _CYCLES:
+    if not found.size and frequency * some < cycles:
         found, height = np.array([2.0 * np.pi * frequency]), np.ones(1)
-    if np.count_nonzero(height > 1e-3) > _MAX_TONES:
+    if np.count_nonzero(height > 1e-3) > max_tones:
         return None
-    found = found[height > _MAX_DISTORTION]
-    while 0 < found.size <= _MAX_TONES:
+    found = found[height > max_distortion]
+    while 0 < found.size <= max_tones:
         tones = Tones.from_samples(values[:size], found)
         found, rest = tones.frequencies, values[:size] - tones.values()
         if not _is_noise(rest, values[:size]):
             added, height = _find_lines(rest[:_SOME])
-            cycle, is_carrier = 2.0 * np.pi / size, np.min(found) > 2.0 * np.pi * _CYCLES / some
+            cycle, is_carrier = 2.0 * np.pi / size, np.min(found) > 2.0 * np.pi * cycles / some
             apart = np.abs(added[:, None] - found).min(axis=1, initial=np.inf) > cycle
             apart &= height > 0.05
-            is_small = is_carrier or np.std(rest) < _MAX_DISTORTION * np.std(values[:size])
+            is_small = is_carrier or np.std(rest) < max_distortion * np.std(values[:size])
             if size > some or not apart.any() or not is_small:
                 return None
             found = np.append(found, added[apart])
@@ -128,16 +129,16 @@ def find_tones(values: Samples, frequency: float) -> Tones | None:
     return None
 
 
-def _is_noise(rest: Samples, values: Samples) -> bool:
-    """Return whether the rest of a signal is white noise: neighbours differ as much as all, and means hardly.
+def _is_noise(rest: Samples, values: Samples, block: int = 32) -> bool:
+    """Return whether the rest of a signal is white noise: neighbours differ as much as all, and means of blocks hardly.
 
     The rounding of the values may be the same for some samples.
     """
     white = float(np.std(np.diff(rest, 3))) / np.sqrt(20.0)
     rounding = float(np.min(np.diff(np.unique(values[:_SOME])), initial=np.inf)) / np.sqrt(12.0)
-    means = rest[: rest.size // _BLOCK * _BLOCK].reshape(-1, _BLOCK).mean(axis=1)
+    means = rest[: rest.size // block * block].reshape(-1, block).mean(axis=1)
     is_alike = np.std(rest) < 1.5 * max(white, rounding)
-    return bool(is_alike and np.std(means) < max(2.0 * white / np.sqrt(_BLOCK), rounding))
+    return bool(is_alike and np.std(means) < max(2.0 * white / np.sqrt(block), rounding))
 
 
 def _find_lines(values: Samples) -> tuple[Float[np.ndarray, " lines"], Float[np.ndarray, " lines"]]:
@@ -145,8 +146,10 @@ def _find_lines(values: Samples) -> tuple[Float[np.ndarray, " lines"], Float[np.
 
     They are above its noise and the side lobes. There are none if the largest may be a part of the mean.
     """
-    angles, lobe = 2.0 * np.pi * np.arange(values.size) / values.size, round(2 * _LOBE)
-    window = sum(weight * np.cos(i * angles) for i, weight in enumerate(_WINDOW))
+    angles, lobe = 2.0 * np.pi * np.arange(values.size) / values.size, 8  # half width of its main lobe, in half cycles
+    # Blackman and Harris, with side lobes of -92 dB (Proc. IEEE 66 (1978) 51)
+    weights = 0.35875, -0.48829, 0.14128, -0.01168
+    window = sum(weight * np.cos(i * angles) for i, weight in enumerate(weights))
     size = np.abs(np.fft.rfft(window * values, 2 * values.size))
     if np.argmax(size) < 2 * lobe:
         return np.empty(0), np.empty(0)

@@ -161,11 +161,10 @@ class RecordedCurrent:
     @functools.cached_property
     def start_delay(self) -> float:
         """Delay of I in time steps, from which a fit starts: that of a carrier, whose current follows dV/dt; else 0."""
-        found = self.tones and self.tones.carrier_gain(self.I)
-        if found is None:
+        if self.tones is None or self.tones.carrier is None:
             return 0.0
-        gain, frequency = found
-        return float(np.clip(-np.angle(gain / 1j) / frequency, -MAX_STEPS, MAX_STEPS))
+        phase = np.angle(self.tones.carrier_gain(self.I) / 1j)
+        return float(np.clip(-phase / self.tones.carrier, -MAX_STEPS, MAX_STEPS))
 
     @property
     def is_coarse(self) -> bool:
@@ -236,11 +235,11 @@ class RecordedCurrent:
 
     def _carrier_correction(self, delay: float) -> float:
         """Return the mean of a carrier over a step, over that by `step_means`: 1.0003 for ten samples in a period."""
-        found = self.tones and self.tones.carrier_gain(self.I)
-        if found is None:
+        frequency = self.tones and self.tones.carrier
+        if frequency is None:
             return 1.0
         taps, _ = mean_filter(delay)
-        return float(np.sinc(found[1] / (2.0 * math.pi)) / abs(np.exp(-1j * found[1] * np.arange(taps.size)) @ taps))
+        return float(np.sinc(frequency / (2.0 * math.pi)) / abs(np.exp(-1j * frequency * np.arange(taps.size)) @ taps))
 
     def rise(self, V: Rows) -> Rows:
         """Return the rise of a drive over each step, V/s, stored as rows are."""

@@ -72,8 +72,8 @@ def estimate_from_vsc(
         rows = np.stack([voltage[part], integral[part], ones, line[part], vsc[part]], axis=1)
         R = np.asarray(np.linalg.qr(np.vstack([R, rows[inside[part]]]), mode="r"))
     (g, slope, _, direct), *_ = np.linalg.lstsq(R[:, :4], R[:, 4], rcond=None)
-    if choice.name == "measured" and record.tones is not None and (found := record.tones.carrier_gain(vsc)):
-        g, slope = abs(found[0]), 0.0
+    if choice.name == "measured" and record.tones is not None and record.tones.carrier is not None:
+        g, slope = abs(record.tones.carrier_gain(vsc)), 0.0
     if g >= max_divider:
         raise InputError(
             f"{record.source}: Vsc is {g:.3g} times V at a step, but this circuit excludes 1/2 or more;"
