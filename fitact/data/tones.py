@@ -26,7 +26,7 @@ class Tones(NamedTuple):
     def from_samples(cls, values: Samples, frequencies: Float[np.ndarray, " tones"], rounds: int = 8) -> Self:
         """Fit all parameters by least squares; `frequencies` are a start, better than half a cycle per record."""
         tones, count = cls(0.0, np.zeros(frequencies.size, complex), frequencies, values.size), frequencies.size
-        for _ in range(rounds):
+        for number in range(rounds):
             products = np.zeros(2 * [2 + 3 * count])
             for first in range(0, values.size, _SOME):
                 last = min(first + _SOME, values.size)
@@ -38,11 +38,11 @@ class Tones(NamedTuple):
             linear = slice(1 + 2 * count)
             mean, *parts = np.linalg.lstsq(products[linear, linear], products[linear, -1])[0]
             phasors = np.array(parts[:count]) + 1j * np.array(parts[count:])
-            if np.array_equal(tones.phasors, np.zeros(count)):  # whose frequencies have no slopes yet
-                tones = tones._replace(mean=float(mean), phasors=phasors)
+            tones = tones._replace(mean=float(mean), phasors=phasors)
+            if number == 0:  # without phasors, the frequencies had no slopes
                 continue
             change = np.linalg.lstsq(products[:-1, :-1], products[:-1, -1])[0][-count:]
-            tones = cls(float(mean), phasors, tones.frequencies + change / values.size, values.size)
+            tones = tones._replace(frequencies=tones.frequencies + change / values.size)
             if np.max(np.abs(change)) < 1e-5:
                 break
         return tones
@@ -79,8 +79,8 @@ class Tones(NamedTuple):
         return np.linalg.qr(np.vstack([np.ones(self.size), waves.real, waves.imag]).T)[0].T
 
     def _sum(self, phasors: Complex[np.ndarray, " tones"]) -> Samples:
-        parts = (slice(first, min(first + _SOME, self.size)) for first in range(0, self.size, _SOME))
-        return self.mean + np.concatenate([(phasors @ self._waves(part.start, part.stop)).real for part in parts])
+        parts = (self._waves(first, min(first + _SOME, self.size)) for first in range(0, self.size, _SOME))
+        return self.mean + np.concatenate([(phasors @ waves).real for waves in parts])
 
     @property
     def _strongest(self) -> int:
@@ -146,15 +146,16 @@ def _find_lines(values: Samples) -> tuple[Float[np.ndarray, " lines"], Float[np.
 
     They are above its noise and the side lobes. There are none if the largest may be a part of the mean.
     """
-    angles, lobe = 2.0 * np.pi * np.arange(values.size) / values.size, 8  # half width of its main lobe, in half cycles
+    angles, padded = 2.0 * np.pi * np.arange(values.size) / values.size, 1 << (2 * values.size - 1).bit_length()
+    lobe = round(3.75 * padded / values.size)  # almost the half width of the window's main lobe, which is four cycles
     # Blackman and Harris, with side lobes of -92 dB (Proc. IEEE 66 (1978) 51)
     weights = 0.35875, -0.48829, 0.14128, -0.01168
     window = sum(weight * np.cos(i * angles) for i, weight in enumerate(weights))
-    size = np.abs(np.fft.rfft(window * values, 2 * values.size))
+    size = np.abs(np.fft.rfft(window * values, padded))
     if np.argmax(size) < 2 * lobe:
         return np.empty(0), np.empty(0)
     middle, floor = size[1:-1], max(5e-5 * float(size.max()), 6.0 * float(np.median(size)))
     is_line = (middle > size[:-2]) & (middle >= size[2:]) & (middle > floor)
     is_line[: lobe - 1] = False
     lines = np.flatnonzero(is_line) + 1
-    return lines * np.pi / values.size, size[lines] / size.max()
+    return lines * 2.0 * np.pi / padded, size[lines] / size.max()

@@ -132,6 +132,11 @@ class ChannelLikelihood(eqx.Module):
         """Return the channel with other fields of its timing."""
         return self.replace_observable(timing=dataclasses.replace(self.timing, **changes))
 
+    def set_noise_gain(self, terms: HighpassTerms) -> Self:
+        """Return the channel in which the noise of a recorded V has the gain of a circuit, whose `terms` these are."""
+        gain = np.asarray(terms.gain_in_step(self.timing.step), dtype=float)
+        return self.replace_observable(noise_gain=gain)
+
     def without_compression(self) -> Self:
         return dataclasses.replace(self, compression=None, expansion=None)
 

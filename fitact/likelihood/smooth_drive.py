@@ -21,13 +21,15 @@ _ROUNDS = 5  # of smoothing, each over twice as many samples as the one before
 _REACH = len(_WEIGHTS) // 2 * (2**_ROUNDS - 1)  # of all rounds to either side, in samples
 
 
-def smooth_drive(V: Any, noise: ArrayLike, transition: float = 1.5) -> Any:
-    """Return V (..., samples) without most of its white noise, of sd `noise` (V).
+def smooth_drive(V: Any, noise: ArrayLike, tones: Tones | None = None, transition: float = 1.5) -> Any:
+    """Return V (..., samples) without most of its white noise, of sd `noise` (V): its `tones`, if it has few.
 
-    V is what five rounds of smoothing leave, and the details that each took away (a wavelet transform with holes). A
-    detail below 4.5 sd of its noise in the finest, and below 2.5 in the coarsest, which has fewer independent values,
-    is left out. One `transition` sd above that is kept, so that an edge stays as it is.
+    Else, it is what five rounds of smoothing leave, and the details that each took away (a wavelet transform with
+    holes). A detail below 4.5 sd of its noise in the finest, and below 2.5 in the coarsest, which has fewer independent
+    values, is left out. One `transition` sd above that is kept, so that an edge stays as it is.
     """
+    if tones is not None:
+        return tones.values()
     xp, count = array_module(V), V.shape[-1]
     around = [(0, 0)] * (V.ndim - 1) + [(_REACH, _REACH)]
     scales = [each[..., :count] for each in _smooth(xp.pad(V, around, mode="reflect", reflect_type="odd"))]

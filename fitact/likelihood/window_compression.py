@@ -233,10 +233,7 @@ class WindowCompressor:
         Also what lines between its samples lack, where Vsc is late.
         """
         tones = self.tones and self.tones.continue_with(V)
-        if tones is not None:
-            smooth = tones.values()
-        else:
-            smooth = smooth_drive(V, self.noise_V) if self.noise_V else V
+        smooth = smooth_drive(V, self.noise_V, tones) if self.noise_V else V
         number = np.arange(float(V.size))
         return smooth, np.interp(number - self.late, number, curve_drive(smooth, self.late, tones) - smooth)
 

@@ -166,8 +166,7 @@ def _set_drive_noise(
                 path = NoisePath.from_terms(terms, stray, record.time_step)
                 channel = set_drive(channel, path, record, RecordedCurrent.from_record(record).smooth)
             else:
-                gain = np.asarray(terms.gain_in_step(channel.timing.step), dtype=float)
-                channel = channel.replace_observable(noise_gain=gain)
+                channel = channel.set_noise_gain(terms)
             likelihood = likelihood.replace_channel(i, channel)
     return likelihood
 
@@ -390,10 +389,8 @@ def _can_smooth(choice: DriveModel, template: Circuit) -> bool:
 
 def smooth_recorded_drive(record: Record) -> Float[np.ndarray, " samples"] | None:
     """Return V as a delay shifts it; None if it has no noise."""
-    if record.tones is not None:
-        return pad_samples(record.tones.values())
     noise = record.noise("V")
-    return pad_samples(smooth_drive(record["V"], noise)) if noise else None
+    return pad_samples(smooth_drive(record["V"], noise, record.tones)) if noise else None
 
 
 def _require_whole_drive(record: Record, choice: DriveModel) -> None:

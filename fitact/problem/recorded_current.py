@@ -146,7 +146,7 @@ class RecordedCurrent:
     @functools.cached_property
     def smooth(self) -> Rows:
         """V without its noise, before any fit."""
-        return smooth_drive(self.V, math.hypot(*self.noise_V)) if self.tones is None else self.tones.values()
+        return smooth_drive(self.V, math.hypot(*self.noise_V), self.tones)
 
     @functools.cached_property
     def bend(self) -> Rows:

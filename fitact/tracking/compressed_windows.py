@@ -210,9 +210,7 @@ def _set_noise_gains(likelihood: Likelihood, circuit: CircuitValues) -> Likeliho
     """Return the likelihood in which the noise of V has the gain of the fitted circuit, and not of the fit's start."""
     for i, channel in enumerate(likelihood.channels):
         if channel.shifts_response:
-            gain = circuit.terms[channel.channel].gain_in_step(float(channel.timing.step))
-            channel = channel.replace_observable(noise_gain=np.asarray(gain, dtype=float))
-            likelihood = likelihood.replace_channel(i, channel)
+            likelihood = likelihood.replace_channel(i, channel.set_noise_gain(circuit.terms[channel.channel]))
     return likelihood
 
 
