@@ -217,6 +217,7 @@ def _collect_remarks(
             warnings += remarks.channel_warnings(source.record, source.choice, channel.channel, channel.figures)
     warnings += misfit_warnings(traces)
     warnings += remarks.parameter_warnings(likelihood, theta)
+    warnings += remarks.skewness_warnings(laplace)
     stated = [each.name for each in problem.coordinates if each.is_stated]
     spread = np.linalg.norm(laplace.covariance_root, axis=1)
     warnings += remarks.prior_warnings(likelihood, theta, spread, stated)

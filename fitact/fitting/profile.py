@@ -110,6 +110,23 @@ def profile_intervals(laplace: Laplace, names: Sequence[str], level: float, prio
     return intervals
 
 
+def compare_with_normal(laplace: Laplace, name: str, z: float) -> tuple[float, float]:
+    """Return how many standard deviations the data hold `z` of them below and above the optimum for.
+
+    These are roots of the deviance of the profile of one of `PROFILE_QUANTITIES`: `z` if its posterior is normal.
+    """
+    index, sd = PROFILE_QUANTITIES.index(name), laplace.derived_log_sd[DERIVED_NAMES.index(name)]
+    with double_precision():
+        model = ConstrainedFit(laplace.likelihood.without_samples(), jnp.asarray(laplace.sigmas), laplace.derive)
+        weight = np.array([0.0, 0.0, 20.0 / sd, 20.0 / sd])
+        center = float(laplace.log_derived[0][DERIVED_NAMES.index(name)])
+        goal, points = center + z * sd * np.array([0.0, 0.0, -1.0, 1.0]), np.tile(laplace.theta, (4, 1))
+        _, value, deviance = map(np.asarray, _fit_constrained(model, np.full(4, index), goal, weight, points))
+    distance = np.abs(value[2:] - value[0]) / (z * sd)  # slightly less than 1
+    low, high = np.sqrt(np.maximum(deviance[2:] - deviance[0], 0.0)) / distance
+    return float(low), float(high)
+
+
 def interval_bounds(
     model: ConstrainedFit,
     theta: Float[np.ndarray, " parameters"],

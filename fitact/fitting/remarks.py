@@ -10,6 +10,9 @@ from jaxtyping import Float
 from fitact.data.plausibility import check_plausibility, insulator_voltage
 from fitact.data.record import CHANNEL_UNITS, Record
 from fitact.data.spectrum import Spectrum
+from fitact.fitting.derived import DERIVED_NAMES
+from fitact.fitting.laplace import Laplace
+from fitact.fitting.profile import compare_with_normal
 from fitact.fitting.residual_statistics import is_undersampled
 from fitact.inspection.inspection import check_divider
 from fitact.instrument.classes import USUAL_STRAY
@@ -92,6 +95,23 @@ def parameter_warnings(likelihood: Likelihood, theta: Float[np.ndarray, " parame
                 " peak versus peak-to-peak"
             )
     return warnings
+
+
+def skewness_warnings(laplace: Laplace, least_sd: float = 0.2, least_share: float = 0.8) -> list[str]:
+    """Return a warning if b is known less than its standard error says, towards long or short ones.
+
+    That is possible if it is uncertain by `least_sd` or more: a record may tell no more than that b is long.
+    """
+    sd = laplace.derived_log_sd[DERIVED_NAMES.index("b")]
+    if not sd > least_sd or any(channel.compression is None for channel in laplace.likelihood.channels):
+        return []
+    roots = compare_with_normal(laplace, "b", z=3.0)
+    return [
+        f"the time constant b may be much {way} than its standard error of {format_percent(float(sd))} says: three of"
+        f" these count as {root:.1f}; sample the posterior, or see the intervals of the fit"
+        for way, root in zip(("shorter", "longer"), roots, strict=True)
+        if root < 3.0 * least_share
+    ]
 
 
 def plausibility_warnings(

@@ -1,6 +1,6 @@
 """Optimum of a problem: fits with compression, until effects of instruments and weights of spectra no longer change."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float
@@ -34,8 +34,9 @@ def solve_problem(
     estimate of its drive by more than `max_change` standard errors. It does not go on after `max_steps` of the search,
     of which a model that is wrong may need many. A current with a recorded drive that has not settled ends with its
     most probable fit. A delay that is known to a tenth of a step may change without end, by up to half a step, if the
-    other parameters follow it by less than a twentieth of a standard error. Tables are verified at the end; the samples
-    of channels whose table fails are summed from there on.
+    other parameters follow it by less than a twentieth of a standard error. Tables are verified at the end. If one does
+    not reach far enough, they are made again around the optimum, as wide as possible; the samples of channels whose
+    table still fails are summed from there on.
 
     A start far from the answer may lead delays astray, by more steps than the rounds lead them back. A fit that has not
     settled, with a delay of more than `max_late` prior standard deviations, starts again from its circuit, without its
@@ -77,7 +78,8 @@ def solve_problem(
             certified, failed = _certify(solved, root, reasons, tolerance)
             if not failed:
                 return solved, certified, root
-            full, likelihood = full | failed, _decompress(likelihood, failed)
+            problem, full = _replace_tables(problem._replace(likelihood=likelihood), theta, full, failed)
+            likelihood = problem.likelihood
         elif has_rows:
             likelihood = update_rows(likelihood, solved, problem.sources)
             theta = np.where(likelihood.follows_rows, 0.0, theta)  # their delays have moved into the rows
@@ -92,11 +94,13 @@ def solve_problem(
     root = solved.covariance_factor()
     certified, failed = _certify(solved, root, reasons, tolerance)
     while failed:
-        theta, full = solved.theta[_find_places(solved, problem.likelihood)], full | failed
-        problem = problem._replace(likelihood=_decompress(problem.likelihood, failed))
+        theta = solved.theta[_find_places(solved, problem.likelihood)]
+        problem, full = _replace_tables(problem, theta, full, failed)
+        likelihood, reasons = problem.compress_likelihood(tolerance, full)
+        problem = problem._replace(likelihood=likelihood)
         solved = _solve(problem, tolerance, full, theta)
         root = solved.covariance_factor()
-        certified, failed = _certify(solved, root, certified.reasons, tolerance)
+        certified, failed = _certify(solved, root, reasons, tolerance)
     return solved, certified, root
 
 
@@ -136,10 +140,21 @@ def _certify(
     return certified, {i: why for i, (channel, why) in pairs if why and channel.compression is not None}
 
 
-def _decompress(likelihood: Likelihood, channels: Iterable[int]) -> Likelihood:
-    for i in channels:
+def _replace_tables(
+    problem: Problem, theta: Float[np.ndarray, " parameters"], full: dict[int, str], failed: Mapping[int, str]
+) -> tuple[Problem, dict[int, str]]:
+    """Return the problem without the tables that failed, and the channels without a table, and why.
+
+    If that is only because they do not reach far enough, the next ones are made around `theta`, and wide.
+    """
+    outside = [i for i, why in failed.items() if why == certificate.OUTSIDE and not problem.is_wide]
+    if outside:
+        problem = problem._replace(start=theta, is_wide=True)
+    full = full | {i: why for i, why in failed.items() if i not in outside}
+    likelihood = problem.likelihood
+    for i in failed:
         likelihood = likelihood.replace_channel(i, likelihood.channels[i].without_compression())
-    return likelihood
+    return problem._replace(likelihood=likelihood), full
 
 
 def _find_places(solved: LeastSquaresResult, likelihood: Likelihood) -> list[int]:

@@ -19,13 +19,21 @@ from fitact.likelihood.interpolation import interpolate
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import StudentExpansion, fit_student_scale, student_curvature, student_weight
 from fitact.likelihood.observable import ChannelInputs
-from fitact.likelihood.projection import MANY_SAMPLES, compress, is_exactly_uniform, samples_per_period, table_multiple
+from fitact.likelihood.projection import (
+    MANY_SAMPLES,
+    compress,
+    is_exactly_uniform,
+    samples_per_period,
+    table_multiple,
+)
 from fitact.likelihood.spectrum_observable import SpectrumObservable
 from fitact.model.circuit import HighpassTerms
 from fitact.model.drive import Sampled
+from fitact.model.response_table import TABLE_HALF_WIDTH
 from fitact.model.skin import WithSkin
 
 TOLERANCE = 1e-3  # error of the log-likelihood
+OUTSIDE = "its parameters, or their uncertainty, lie outside the range of the compression"
 _TIMING_REASON = "a delay or a clock error is a free parameter"
 FEW_ROWS = 200  # numbers per evaluation, below which the overhead of the call dominates
 
@@ -40,12 +48,17 @@ class CertifiedLikelihood(NamedTuple):
 
 
 def compress_channel(
-    channel: ChannelLikelihood, start: CircuitValues, tolerance: float, student: np.ndarray | None = None
+    channel: ChannelLikelihood,
+    start: CircuitValues,
+    tolerance: float,
+    student: np.ndarray | None = None,
+    *,
+    is_wide: bool = False,
 ) -> tuple[ChannelLikelihood, str]:
     """Return the channel with a compression and "", or the uncompressed channel and the reason.
 
     The compression holds around the circuit `start`, for the channel's present noise and timing. For Student-t noise,
-    it needs an expansion (`expand_student`); `student` is as in `compress`.
+    it needs an expansion (`expand_student`); `student` and `is_wide` are as in `compress`.
     """
     circuit, channel = start.circuit, channel.without_compression()
     reason = reason_against_table(channel, start, tolerance)
@@ -62,6 +75,7 @@ def compress_channel(
         "charges": samples.charges and samples.charges.restrict(part),
         "rate": None if samples.rate is None else np.asarray(samples.rate)[part],
         "effects": None if samples.effects is None else np.asarray(samples.effects)[:, part],
+        "is_wide": is_wide,
     }
     terms = electrical.select_terms(start.terms[channel.channel])
     if isinstance(circuit, WithSkin):
@@ -100,7 +114,17 @@ def fold(channel: ChannelLikelihood) -> ChannelLikelihood:
 
 def recompress(channel: ChannelLikelihood, circuit: CircuitValues) -> ChannelLikelihood:
     """Return a channel whose noise or timing has changed with a new compression, if it had one and a table serves."""
-    return channel if channel.compression is None else compress_channel(channel, circuit, TOLERANCE)[0]
+    if channel.compression is None:
+        return channel
+    return compress_channel(channel, circuit, TOLERANCE, is_wide=_is_wide(channel))[0]
+
+
+def _is_wide(channel: ChannelLikelihood) -> bool:
+    """Return whether the table of a channel is as wide as possible, or it has none."""
+    table = channel.compression
+    if not isinstance(table, Compression) or isinstance(table, GridCompression):
+        return True
+    return float(np.max(table.half_width)) > 4.5 * TABLE_HALF_WIDTH  # wider than those of several time constants
 
 
 def reason_against_compression(channel: ChannelLikelihood, tolerance: float, min_samples: int = 512) -> str:
@@ -252,11 +276,11 @@ def certify(
     """Return the likelihood for sampling around the optimum `theta`, checked against the full sum.
 
     `covariance_factor` is a factor of the covariance of theta. The compressed log-likelihood of each channel must be
-    exact to `tolerance` / (number of channels) at the optimum and `check_points` points around it. At almost as many
-    points of the prior, an additional 1e-6 of the difference to the optimum is allowed. An expansion of Student-t noise
-    may have an error `expanded_factor` times as large: an error of 0.01 moves quantiles by less than 0.01 sd. Rows of
-    charge, whose signal is up to a million times the noise of V, may have one a hundred times as large, and within the
-    prior a thousandth of the difference.
+    exact to `tolerance` / (number of channels) and 1e-6 of the difference to the optimum, at the optimum, at
+    `check_points` points around it, and at almost as many points of the prior. An expansion of Student-t noise may have
+    an error `expanded_factor` times as large: an error of 0.01 moves quantiles by less than 0.01 sd. Rows of charge,
+    whose signal is up to a million times the noise of V, may have one a hundred times as large, and within the prior a
+    thousandth of the difference.
     """
     channels = tuple(channel.drop_unused_columns() for channel in likelihood.channels)
     likelihood = dataclasses.replace(likelihood, channels=channels)
@@ -292,7 +316,12 @@ def certify(
     is_expanded = np.array([channel.expansion is not None for channel in likelihood.channels])
     differences = compressed - exact
     differences -= np.where(is_expanded, differences[0], 0.0)
-    errors = np.max(np.abs(differences)[: len(around)], axis=0)
+    # where the density is far from normal, some of the points around the optimum are far from it in log-likelihood
+    errors = np.max((np.abs(differences) - 1e-6 * np.abs(exact - exact[0]))[: len(around)], axis=0)
+    ends = [optimum.tau * np.exp(side * 0.3 * reach) for side in (-1.0, 1.0)]  # six standard deviations
+    for i, channel in enumerate(likelihood.channels):
+        if not (is_expanded[i] or _is_wide(channel) or all(_covers(channel, tau) for tau in ends)):
+            errors[i] = np.nan  # a wider table serves more draws
     # far from the optimum, the error may grow with the difference in log-likelihood to the optimum
     has_rows = np.array([channel.samples.has_drive_noise for channel in likelihood.channels])
     relative = np.where(has_rows, 1e-3, 1e-6)
@@ -326,7 +355,7 @@ def table_precision(noise: ArrayLike, tolerance: float = TOLERANCE) -> Float[np.
 def _compression_failure(error: float, excess: float, tolerance: float) -> str:
     """Return why a compression fails, from its errors near the optimum and within the prior; "" if it passes."""
     if np.isnan(error):
-        return "its parameters, or their uncertainty, lie outside the range of the compression"
+        return OUTSIDE
     if not error <= tolerance:
         return f"the error of the compressed log-likelihood is {error:.2g} near the optimum"
     return f"the error of the compressed log-likelihood is {excess:.2g} within the prior" if excess > tolerance else ""

@@ -68,6 +68,8 @@ def compress(
     student: Float[np.ndarray, "3 samples"] | None = None,
     effects: Float[np.ndarray, "effects samples"] | None = None,
     noise: Float[np.ndarray, " samples"] | None = None,
+    is_wide: bool = False,
+    wide_margins: tuple[float, float] = (4.0, 8.0),
 ) -> Compression:
     """Project a record on responses to `drive`, for time constants within a factor 9 of the one in `expected_terms`.
 
@@ -76,11 +78,13 @@ def compress(
 
     A `Sampled` drive has the times of the record, and may be padded. The response of `expected_terms` is close to the
     record; it is subtracted before and added after, so that the noise keeps its digits. The table covers more than a
-    factor 9 if several terms need it (see `table_multiple`). `weight` multiplies the residuals of the samples
-    (0 excludes a sample, None means 1). `rate` is dV/dt (V/s) for a channel that follows it. `slope` replaces dV/dt in
-    the field of that name. `student` holds weights of the squares, and two functions to be projected instead of the
-    record; `observed` and its slope are then without the model at which they were computed. `charges` are rows that
-    take the place of `observed`, `rate` and `slope`, and of the filter. `effects` are further functions of the model.
+    factor 9 if several terms need it (see `table_multiple`), or if `is_wide`: then by the powers `wide_margins` of 9
+    below and above, since a record may tell of a long time constant no more than that it is long. `weight` multiplies
+    the residuals of the samples (0 excludes a sample, None means 1). `rate` is dV/dt (V/s) for a channel that follows
+    it. `slope` replaces dV/dt in the field of that name. `student` holds weights of the squares, and two functions to
+    be projected instead of the record; `observed` and its slope are then without the model at which they were computed.
+    `charges` are rows that take the place of `observed`, `rate` and `slope`, and of the filter. `effects` are further
+    functions of the model.
 
     With `noise`, the response to a measured drive on a uniform grid can be shifted by up to `MAX_DELAY` steps; V is
     then taken as constant before the first and after the last sample. The noise is what was recorded of V beside the
@@ -89,12 +93,16 @@ def compress(
     Terms of a grid of time constants have arrays of weights and time constants; the table then holds the responses of
     the grid instead of series.
     """
-    reach = None
-    if charges is not None and time.size <= MANY_SAMPLES and isinstance(expected_terms.tau, tuple):
-        # I with a noisy V may leave b uncertain by more than a usual table covers
-        multiple = 1 + table_multiple(np.array(expected_terms.tau))
-        reach = multiple * TABLE_HALF_WIDTH, node_count(multiple * TABLE_HALF_WIDTH)
-    table = TableNodes.from_terms(expected_terms, time, narrow=student is not None, reach=reach)
+    margins = None
+    if student is None and isinstance(expected_terms.tau, tuple):
+        tau = np.array(expected_terms.tau)
+        if is_wide:
+            below, above = wide_margins
+            margins = below * TABLE_HALF_WIDTH, above * TABLE_HALF_WIDTH
+        elif charges is not None and time.size <= MANY_SAMPLES:
+            # I with a noisy V may leave b uncertain by more than a usual table covers
+            margins = 2 * ((1 + table_multiple(tau)) * TABLE_HALF_WIDTH - 0.5 * float(np.ptp(np.log(tau))),)
+    table = TableNodes.from_terms(expected_terms, time, narrow=student is not None, margins=margins)
     if table.expected_direct is not None:  # V is one more function, the last of the effects
         voltage = evaluate_voltage(drive, time, steady_state)[None]
         effects = voltage if effects is None else np.concatenate([effects, voltage])
@@ -166,16 +174,27 @@ class TableNodes(eqx.Module):
 
     @classmethod
     def from_terms(
-        cls, expected_terms: HighpassTerms, time: np.ndarray, *, narrow: bool, reach: tuple[float, int] | None = None
+        cls,
+        expected_terms: HighpassTerms,
+        time: np.ndarray,
+        *,
+        narrow: bool,
+        margins: tuple[float, float] | None = None,
+        count: int | None = None,
     ) -> "TableNodes":
-        """Make the table of these terms at `time`; `reach`: its half-width in log tau, and the nodes that it needs."""
+        """Make the table of these terms at `time`.
+
+        `margins` are what it covers in log tau beyond the terms, below and above, and `count` is the number of nodes.
+        """
         tau, weight = (np.asarray(x, dtype=float) for x in (expected_terms.tau, expected_terms.weight))
         log_tau = np.log(tau)
         center = 0.5 * (np.min(log_tau) + np.max(log_tau))
         if isinstance(expected_terms.tau, tuple):
             # a wide table has functions of few samples, which Student's t may weight negatively
             half_width = 0.5 * np.ptp(log_tau) + NARROW if narrow else table_multiple(tau) * TABLE_HALF_WIDTH
-            half_width, count = reach or (half_width, node_count(half_width))
+            if margins is not None:
+                half_width, center = 0.5 * (np.ptp(log_tau) + sum(margins)), center + 0.5 * (margins[1] - margins[0])
+            count = count or node_count(half_width)
             relative, mix, series = exponential_basis(half_width, count)
             nodes, (_, to_series) = np.exp(center) * relative, chebyshev(count)
             expected = weight @ np.polynomial.chebyshev.chebvander((log_tau - center) / half_width, count - 1)

@@ -95,13 +95,14 @@ class WindowCompressor:
         """
         time, short = step * np.arange(samples), channels[0].count_untabulated(circuit.tau)
         is_single = circuit.tau.size - short == 1
-        reach = (math.log(REACH), count_nodes(math.log(REACH), 1e-8)) if is_single else None
+        margins = 2 * (math.log(REACH),) if is_single else None
+        count = count_nodes(math.log(REACH), 1e-8) if is_single else None
         tables, shared = [], []
         for each in channels:
             terms = each.electrical.select_terms(circuit.terms[each.channel])
             terms = terms.without_fastest(each.count_short(circuit.tau))
-            table = TableNodes.from_terms(terms, time, narrow=False, reach=reach)
-            if reach is not None:
+            table = TableNodes.from_terms(terms, time, narrow=False, margins=margins, count=count)
+            if is_single:
                 kept = slice(RANK)
                 table = dataclasses.replace(table, combinations=table.combinations[:, kept], series=table.series[kept])
             baseline = dict(zip(BASELINE_NAMES, evaluate_baseline(time, table.middle, table.half), strict=True))

@@ -80,6 +80,7 @@ class Problem(NamedTuple):
     sources: tuple[Source, ...]
     start: Float[np.ndarray, " circuit_parameters"]
     coordinates: tuple[ErrorCoordinate, ...]  # of the errors of instruments
+    is_wide: bool = False  # whether tables cover as much as possible around `start`
 
     def compress_likelihood(self, tolerance: float, full: Mapping[int, str]) -> tuple[Likelihood, tuple[str, ...]]:
         """Return the likelihood with compressed channels, and why each of the others is not compressed, or "".
@@ -91,7 +92,7 @@ class Problem(NamedTuple):
             if channel.compression is not None or i in full:
                 found.append((channel, full.get(i, "")))
             else:
-                found.append(certificate.compress_channel(channel, at_start, tolerance))
+                found.append(certificate.compress_channel(channel, at_start, tolerance, is_wide=self.is_wide))
         channels, reasons = zip(*found, strict=True)
         return dataclasses.replace(self.likelihood, channels=channels), reasons
 

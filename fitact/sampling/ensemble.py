@@ -30,7 +30,8 @@ from fitact.sampling import importance
 from fitact.sampling.chain import Chain
 from fitact.sampling.convergence import Convergence, diagnose_chain
 from fitact.sampling.posterior import Posterior
-from fitact.sampling.proposal import OVERDISPERSION, LogProb, Proposal
+from fitact.sampling.proposal import OVERDISPERSION, Proposal
+from fitact.sampling.ridge import LogDensity
 
 Level = Literal["emcee", "psis", "laplace"]
 
@@ -100,7 +101,7 @@ def sample(
             posterior = importance.draw_around_fit(fit, level, log_prob, seed)
             timed = dataclasses.replace(posterior.convergence, seconds=time.perf_counter() - start_time)
             return dataclasses.replace(posterior, convergence=timed)
-        proposal = Proposal.from_laplace(fit.point, fit.point_root, log_prob, fit.sampling_order)
+        proposal = Proposal.from_fit(fit, log_prob)
         track = functools.partial(importance.tracked_quantities, fit)
         target = Target(fit.point_names, log_prob, proposal, track, _fingerprint(fit, seed, walkers, ensembles))
         path = None if chain_file is None else Path(chain_file)
@@ -112,7 +113,7 @@ class Target(NamedTuple):
     """Density that ensembles sample, with a proposal."""
 
     names: tuple[str, ...]  # names of the coordinates
-    log_prob: LogProb  # log-density of points, finite or -inf
+    log_prob: LogDensity  # log-density of points, finite or -inf
     proposal: Proposal  # approximation of the density
     # function of points (ensembles, draws, n) and a seed: derived quantities to diagnose with the coordinates
     track: Callable[[Float[np.ndarray, "ensembles draws n"], int], dict[str, np.ndarray]]
@@ -133,7 +134,7 @@ def make_moves(proposal: Proposal, independent: float = 0.85) -> list[tuple[emce
     return [(emcee.moves.MHMove(proposal.move), independent), (emcee.moves.StretchMove(), 1.0 - independent)]
 
 
-def reject_nonfinite(log_prob: LogProb) -> LogProb:
+def reject_nonfinite(log_prob: LogDensity) -> LogDensity:
     """Replace non-finite values by -inf, because emcee stops at NaN and a walker would be stuck at +inf."""
 
     def finite_log_prob(points: np.ndarray) -> np.ndarray:
@@ -317,7 +318,7 @@ def _defer_interrupts() -> Iterator[Callable[[], None]]:
 
 
 def _draw_starting_points(
-    proposal: Proposal, log_prob: LogProb, walkers: int, random: np.random.RandomState
+    proposal: Proposal, log_prob: LogDensity, walkers: int, random: np.random.RandomState
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw starting points at which the posterior is positive; return them with their log-probabilities."""
     points, values = np.empty((0, proposal.center.size)), np.empty(0)

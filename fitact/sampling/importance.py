@@ -9,10 +9,11 @@ from fitact.fitting import derived
 from fitact.fitting.result import Fit
 from fitact.sampling.convergence import ImportanceWeights, diagnose_weights, pareto_smooth
 from fitact.sampling.posterior import Posterior
-from fitact.sampling.proposal import LogProb, Proposal, draw_student_t, student_log_density
+from fitact.sampling.proposal import Proposal, draw_student_t, student_log_density
+from fitact.sampling.ridge import LogDensity
 
 
-def draw_around_fit(fit: Fit, level: str, log_prob: LogProb, seed: int) -> Posterior:
+def draw_around_fit(fit: Fit, level: str, log_prob: LogDensity, seed: int) -> Posterior:
     """Draw with method `level`, "laplace" or "psis", and diagnose the draws."""
     draws, oversampling = 10_000, 2  # weighted draws of "psis" for each that it returns, so that few are duplicates
     rng = np.random.default_rng([seed, 4])
@@ -20,7 +21,7 @@ def draw_around_fit(fit: Fit, level: str, log_prob: LogProb, seed: int) -> Poste
         z = rng.standard_normal((draws, fit.point.size))
         points, log_density = fit.point + z @ fit.point_root.T, -0.5 * np.sum(z**2, axis=1)
     else:
-        proposal = Proposal.from_laplace(fit.point, fit.point_root, log_prob, fit.sampling_order)
+        proposal = Proposal.from_fit(fit, log_prob)
         points = proposal.draw(rng, oversampling * draws)
         log_density = proposal.log_density(points)
     values = log_prob(points)
@@ -45,7 +46,7 @@ class AdaptedDraws(NamedTuple):
 
 
 def draw_adaptively(
-    log_prob: LogProb,
+    log_prob: LogDensity,
     center: Float[np.ndarray, " n"],
     root: Float[np.ndarray, "n n"],
     random: np.random.Generator,

@@ -12,9 +12,14 @@ from collections.abc import Callable, Sequence
 from typing import Self
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float
 
-LogProb = Callable[[np.ndarray], np.ndarray]
+from fitact.fitting.result import Fit
+from fitact.model.circuit import FINGER_PARAMETERS
+from fitact.sampling import divider_coordinates
+from fitact.sampling.ridge import LogDensity, Ridge, differentiate, follow_ridge
+
 Random = np.random.RandomState | np.random.Generator
 
 OVERDISPERSION = 1.5  # factor on the width of the starting points: ensembles must agree in spite of it
@@ -61,58 +66,11 @@ class TabulatedMarginal:
 
 
 @dataclasses.dataclass(frozen=True)
-class Ridge:
-    """Normal approximations of the density at positions along one coordinate, in those coordinates that it bends.
-
-    They change linearly between the positions, and not beyond the first and the last.
-    """
-
-    along: int
-    bent: list[int]
-    first: float  # position
-    spacing: float  # of the positions
-    centers: Float[np.ndarray, "positions bent"]
-    factors: Float[np.ndarray, "positions bent bent"]  # upper triangular, of the inverse covariances
-
-    def bend(self, z: Float[np.ndarray, "count n"]) -> tuple[np.ndarray, Float[np.ndarray, " count"]]:
-        """Return coordinates for those that are standard normal across the ridge, and log of the change of volume."""
-        (center, factor), bent = self._interpolate(z[:, self.along]), np.array(z)
-        bent[:, self.bent] = center + np.linalg.solve(factor, z[:, self.bent, None])[..., 0]
-        return bent, -_log_determinant(factor)
-
-    def straighten(self, z: Float[np.ndarray, "count n"]) -> tuple[np.ndarray, Float[np.ndarray, " count"]]:
-        """Return the inverse of `bend`, and the same logarithm."""
-        (center, factor), straight = self._interpolate(z[:, self.along]), np.array(z)
-        straight[:, self.bent] = (factor @ (z[:, self.bent] - center)[..., None])[..., 0]
-        return straight, -_log_determinant(factor)
-
-    def is_straight(self, tolerance: float = 0.25) -> bool:
-        """Return whether the approximations are nearly equal."""
-        scatter = np.ptp(self.centers, axis=0), np.abs(self.factors - np.eye(len(self.bent)))
-        return all(np.max(each) < tolerance for each in scatter)
-
-    def scale(self, lengths: Float[np.ndarray, " n"]) -> "Ridge":
-        """Return the ridge in coordinates whose units are longer by factors."""
-        others, along = lengths[self.bent], lengths[self.along]
-        factors = self.factors * others / others[:, None]
-        return Ridge(self.along, self.bent, self.first / along, self.spacing / along, self.centers / others, factors)
-
-    def _interpolate(self, positions: Float[np.ndarray, " count"]) -> tuple[np.ndarray, np.ndarray]:
-        place = np.clip((positions - self.first) / self.spacing, 0.0, len(self.centers) - 1.0)
-        before = np.minimum(place.astype(int), len(self.centers) - 2)
-        share = (place - before)[:, None]
-        center, factor = (
-            (1.0 - share) * flat[before] + share * flat[before + 1]
-            for flat in (self.centers, self.factors.reshape(len(self.factors), -1))
-        )
-        return center, factor.reshape(-1, *self.factors.shape[1:])
-
-
-@dataclasses.dataclass(frozen=True)
 class Proposal:
     """Proposal density in the coordinates of the posterior.
 
-    A point is `center` and a sum of `axes`, whose factors the `ridges` bend, the last one first.
+    A point is `center` and a sum of `axes`, whose factors the `ridges` bend, the last one first. With `elements`, which
+    are the places of log Rsc, log Csc and log Ci in a point, these are in the coordinates of `divider_coordinates`.
     """
 
     center: Float[np.ndarray, " n"]
@@ -122,13 +80,49 @@ class Proposal:
     # densities of some coordinates, relative to the origin
     tables: dict[int, TabulatedMarginal] = dataclasses.field(default_factory=dict)
     student_share: float = 0.1  # fraction drawn from the Student-t alone, so that the support has no bounds
+    elements: Sequence[int] = ()
+
+    @classmethod
+    def from_fit(cls, fit: Fit, log_prob: LogDensity, count: int = 1000) -> Self:
+        """Build a proposal around a fit, in those of three sets of coordinates that serve best.
+
+        If the posterior is not normal, it may be curved in several ways. It is then described along the time constant
+        first, along principal axes in the same coordinates, or in the elements. The variance of importance weights
+        decides, from `count` draws of each.
+        """
+        usual = cls.from_laplace(fit.point, fit.point_root, log_prob, fit.sampling_order)
+        if usual.is_normal or fit.sampling_order or not set(FINGER_PARAMETERS) <= set(fit.point_names):
+            return usual
+        elements = [fit.point_names.index(name) for name in FINGER_PARAMETERS]
+        point = divider_coordinates.from_elements(fit.point, elements)
+        root = divider_coordinates.differentiate(fit.point, elements) @ fit.point_root
+
+        def log_density(points: np.ndarray) -> np.ndarray:
+            return log_prob(divider_coordinates.to_elements(points, elements))
+
+        found = [
+            dataclasses.replace(cls._from_axes(point, axes, range(point.size), log_density), elements=elements)
+            for axes in (leading_axes(root, elements[0]), principal_axes(root))
+        ]
+        found.append(usual)
+        random = np.random.default_rng(0)  # any reproducible draws serve
+        points = np.concatenate([each.draw(random, count) for each in found])
+        log_ratios = log_prob(points) - np.stack([each.log_density(points) for each in found])
+        # weights of the draws of all, in whose sum over a proposal what it misses counts most
+        log_weights = -scipy.special.logsumexp(-log_ratios, axis=0)
+        return found[int(np.argmin(scipy.special.logsumexp(log_ratios + log_weights, axis=1)))]
+
+    @property
+    def is_normal(self) -> bool:
+        """Whether the density is nearly normal along all axes."""
+        return not (self.ridges or self.tables)
 
     @classmethod
     def from_laplace(
         cls,
         point: Float[np.ndarray, " n"],
         covariance_factor: Float[np.ndarray, "n n"],
-        log_prob: LogProb,
+        log_prob: LogDensity,
         order: Sequence[int] = (),
     ) -> Self:
         """Build a proposal from a Laplace approximation; follow ridges where `log_prob` is not normal along an axis.
@@ -138,7 +132,14 @@ class Proposal:
         axes are the principal ones.
         """
         axes = triangular_axes(covariance_factor, order) if len(order) else principal_axes(covariance_factor)
-        order, center = _enter_support(np.array(point, dtype=float), axes, list(order), log_prob)
+        return cls._from_axes(np.array(point, dtype=float), axes, order or range(len(axes)), log_prob)
+
+    @classmethod
+    def _from_axes(
+        cls, point: Float[np.ndarray, " n"], axes: Float[np.ndarray, "n n"], order: Sequence[int], log_prob: LogDensity
+    ) -> Self:
+        """Build a proposal with these axes, which are followed in this order."""
+        order, center = _enter_support(point, axes, list(order), log_prob)
         found = cls(center, axes, origin=np.zeros(center.size))
         for i in order:
             if is_normal(found._log_density_along(i, log_prob, PROBES)):
@@ -166,7 +167,8 @@ class Proposal:
         tabulated = random.uniform(size=count) >= self.student_share
         for i, table in self.tables.items():
             z[:, i] = np.where(tabulated, table.draw(random, count), z[:, i])
-        return self._bend(self.origin + z)[0]
+        points = self._bend(self.origin + z)[0]
+        return divider_coordinates.to_elements(points, self.elements) if self.elements else points
 
     def _bend(self, z: Float[np.ndarray, "count n"]) -> tuple[np.ndarray, Float[np.ndarray, " count"]]:
         """Return the points of coordinates without bends, and the logarithm of the change of volume."""
@@ -178,6 +180,7 @@ class Proposal:
 
     def log_density(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, " count"]:
         """Return the logarithm of the density, up to a constant."""
+        points = divider_coordinates.from_elements(points, self.elements) if self.elements else points
         z = np.linalg.solve(self.axes, (points - self.center).T).T
         log_volume = np.zeros(len(z))
         for ridge in self.ridges:
@@ -201,72 +204,33 @@ class Proposal:
         proposed = self.draw(random, len(points))
         return proposed, self.log_density(points) - self.log_density(proposed)
 
-    def _log_target(self, z: Float[np.ndarray, "count n"], log_prob: LogProb) -> Float[np.ndarray, " count"]:
+    def _log_target(self, z: Float[np.ndarray, "count n"], log_prob: LogDensity) -> Float[np.ndarray, " count"]:
         """Return the log-density of coordinates without bends."""
         points, log_volume = self._bend(z)
         return log_prob(points) + log_volume
 
     def _log_density_along(
-        self, axis: int, log_prob: LogProb, positions: Float[np.ndarray, " count"]
+        self, axis: int, log_prob: LogDensity, positions: Float[np.ndarray, " count"]
     ) -> Float[np.ndarray, " count"]:
         """Return it at positions along one of these coordinates from the origin."""
         return self._log_target(self.origin + positions[:, None] * np.eye(self.center.size)[axis], log_prob)
 
-    def _follow_ridge(
-        self,
-        along: int,
-        others: list[int],
-        log_prob: LogProb,
-        spacing: float = 0.25,
-        farthest: float = 10.0,
-        log_density_range: float = 15.0,
-    ) -> Self:
+    def _follow_ridge(self, along: int, others: list[int], log_prob: LogDensity) -> Self:
         """Return the proposal with the ridge along a coordinate, from the origin both ways until the density is low.
 
-        It bends those of the `others` across which the density is nearly normal. From one position to the next,
-        Newton's method starts where the last three lead.
+        It bends those of the `others` across which the density is nearly normal.
         """
         log_target = functools.partial(self._log_target, log_prob=log_prob)
-
-        def climb(z: np.ndarray, factor: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-            """Return the ridge's point near z, a factor there, and the density, which is NaN if there is no ridge."""
-            for _ in range(6):
-                root = np.linalg.inv(factor)
-                height, gradient, hessian = _differentiate(log_target, z, root.T @ unit[bent])
-                if not np.min(np.linalg.eigvalsh(hessian)) > 0.05:
-                    break
-                change = np.linalg.solve(hessian, gradient)
-                if gradient @ change < 0.1:  # twice the increase that is left
-                    return z, np.linalg.cholesky(factor.T @ hessian @ factor).T, height
-                z = z + root @ change / max(1.0, math.sqrt(gradient @ change) / 10.0) @ unit[bent]
-            return z, factor, math.nan
-
         start, unit = np.array(self.origin, dtype=float), np.eye(self.center.size)
         for _ in range(5):
-            _, gradient, hessian = _differentiate(log_target, start, unit[others])
+            _, gradient, hessian = differentiate(log_target, start, unit[others])
             curvature = np.diagonal(hessian)
             usual = (curvature > 0.25) & (curvature < 4.0)
             start[others] += np.clip(np.where(usual, gradient / np.where(usual, curvature, 1.0), 0.0), -2.0, 2.0)
         bent = [other for other, use in zip(others, usual, strict=True) if use]
-        if not bent:
+        ridge = follow_ridge(log_target, start, along, bent) if bent else None
+        if ridge is None:
             return self
-        found = dict[int, tuple[np.ndarray, np.ndarray]]()
-        for way in (1, -1):
-            last, factor, highest = [start] * 3, np.eye(len(bent)), -math.inf
-            for number in range(round(farthest / spacing) + 1):
-                ahead = 3.0 * last[-1] - 3.0 * last[-2] + last[-3]
-                ahead[along] = start[along] + way * number * spacing
-                here, factor, height = climb(ahead, factor)
-                last.append(here)
-                highest = max(highest, height)
-                if not height > highest - log_density_range:
-                    break
-                found[way * number] = here[bent], factor
-        if len(found) < 2:
-            return self
-        numbers = sorted(found)
-        centers, factors = (np.array(values) for values in zip(*[found[number] for number in numbers], strict=True))
-        ridge = Ridge(along, bent, start[along] + spacing * numbers[0], spacing, centers, factors)
         if ridge.is_straight():
             return dataclasses.replace(self, origin=start)
         origin = np.array(self.origin)
@@ -294,6 +258,14 @@ def triangular_axes(covariance_factor: Float[np.ndarray, "n n"], order: Sequence
     return axes
 
 
+def leading_axes(covariance_factor: Float[np.ndarray, "n n"], first: int) -> Float[np.ndarray, "n n"]:
+    """Return the axis along which a coordinate changes, and the principal ones of what is left, as columns."""
+    others = np.delete(np.arange(len(covariance_factor)), first)
+    axes = triangular_axes(covariance_factor, [first, *others])[:, [first, *others]]
+    axes[others, 1:] = principal_axes(axes[others, 1:])
+    return axes
+
+
 def draw_student_t(random: Random, count: int, size: int) -> Float[np.ndarray, "count size"]:
     """Draw from a Student-t around 0 with unit scale matrix."""
     z = random.standard_normal((count, size))
@@ -317,7 +289,7 @@ def _enter_support(
     center: Float[np.ndarray, " n"],
     axes: Float[np.ndarray, "n n"],
     order: list[int],
-    log_prob: LogProb,
+    log_prob: LogDensity,
     draws: int = 4096,
 ) -> tuple[list[int], Float[np.ndarray, " n"]]:
     """Return the order in which to tabulate the axes, and the center, or where no axis meets the support, a draw in it.
@@ -325,7 +297,6 @@ def _enter_support(
     Where a bound excludes the center, the axis that leads to the highest density comes first. Along another, the
     support may begin only far from the data.
     """
-    order = order or list(range(center.size))
     if np.isfinite(log_prob(center[None])[0]):
         return order, center
     heights = [float(np.max(log_prob(center + _SEARCH[:, None] * axis))) for axis in axes.T]
@@ -335,31 +306,6 @@ def _enter_support(
     points = center + draw_student_t(np.random.default_rng(0), draws, center.size) @ axes.T
     values = log_prob(points)
     return order, points[np.argmax(values)] if np.isfinite(values).any() else center
-
-
-def _log_determinant(factor: Float[np.ndarray, "count m m"]) -> Float[np.ndarray, " count"]:
-    return np.sum(np.log(np.diagonal(factor, axis1=1, axis2=2)), axis=1)
-
-
-def _differentiate(
-    log_density: LogProb, z: Float[np.ndarray, " n"], directions: Float[np.ndarray, "m n"], step: float = 0.5
-) -> tuple[float, Float[np.ndarray, " m"], Float[np.ndarray, "m m"]]:
-    """Return a log-density, its gradient and minus its Hessian along some directions, from differences.
-
-    What lies outside the support leaves a gradient of 0 and the Hessian of a standard normal.
-    """
-    m, unit = len(directions), step * directions
-    pairs = np.triu_indices(m, 1)
-    both = unit[pairs[0]] + unit[pairs[1]]
-    values = log_density(z + np.concatenate([np.zeros((1, z.size)), unit, -unit, both, -both]))
-    middle, after, before, up, down = np.split(values, np.cumsum([1, m, m, len(both)]))
-    with np.errstate(invalid="ignore"):
-        gradient, hessian = (after - before) / (2.0 * step), np.diag((2.0 * middle - after - before) / step**2)
-        second = (after + before)[pairs[0]] + (after + before)[pairs[1]] - up - down - 2.0 * middle
-    hessian[pairs] = hessian[pairs[::-1]] = second / (2.0 * step**2)
-    known = np.isfinite(gradient) & np.isfinite(np.diagonal(hessian))
-    hessian = np.where(np.isfinite(hessian) & known & known[:, None], hessian, np.eye(m))
-    return float(middle[0]), np.where(known, gradient, 0.0), hessian
 
 
 def _tabulate(
