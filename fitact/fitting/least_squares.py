@@ -106,7 +106,7 @@ def _solve_round(likelihood: Likelihood, start: Array, sigma: Array, damping: Ar
     def with_prior(theta: Array) -> tuple[Any, Array]:
         return likelihood.residuals(theta, sigma), likelihood.prior_residuals(theta)
 
-    minimum = minimise(with_prior, start, damping=damping)
+    minimum = minimise(with_prior, start, damping=damping, elements=likelihood.elements)
     theta, fraction = minimum.theta, minimum.theta.size / likelihood.count  # parameters per sample
     parts = []
     for (channel, inputs), s in zip(likelihood.channels_and_inputs(theta), sigma, strict=True):

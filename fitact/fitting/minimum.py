@@ -4,16 +4,19 @@ The solver itself is in `fitact.fitting.levenberg_marquardt`. It is imported onl
 program from the disk does without optimistix.
 """
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PyTree
 
 from fitact.compiled import jit
 from fitact.fitting.outcome import RESULT_NAMES, Minimum, result_name
+from fitact.model.divider_coordinates import differentiate, from_elements, to_elements
 
 
 def minimise(
@@ -21,15 +24,22 @@ def minimise(
     start: Float[Array, " parameters"],
     max_steps: int = 300,
     damping: ArrayLike = 1e-2,
+    elements: Sequence[int] = (),
 ) -> Minimum:
     """Find the least-squares optimum nearest to `start`; pure, for use within jit and vmap, in double precision.
 
     Steps are damped in units of the Jacobian's columns (Marquardt 1963). `damping` is that of the first step, relative
-    to the largest curvature.
+    to the largest curvature. Those of `elements`, the places of log Rsc, log Csc and log Ci, are in the coordinates of
+    `divider_coordinates`.
     """
     from fitact.fitting.levenberg_marquardt import find_minimum
 
-    return find_minimum(residuals, start, max_steps, damping)
+    def transformed(point: Array) -> PyTree[Array]:
+        return residuals(to_elements(point, elements))
+
+    end = find_minimum(transformed, from_elements(jnp.asarray(start), elements), max_steps, damping)
+    theta = to_elements(end.theta, elements)
+    return dataclasses.replace(end, theta=theta, jacobian=end.jacobian @ differentiate(theta, elements))
 
 
 class Optima(NamedTuple):
@@ -44,11 +54,12 @@ class Optima(NamedTuple):
 def minimise_many(
     residuals: Callable[[Float[Array, " parameters"]], PyTree[Float[Array, "..."]]],
     starts: Float[np.ndarray, "starts parameters"],
+    elements: Sequence[int] = (),
 ) -> Optima:
     """Minimise from all starts at once; with residuals in units of their sd, the cost is -log(probability)."""
     same_optimum = 0.1  # standard errors, below which end points count as one optimum
     log_density_margin = 3.0  # by which the log-probability of a competing optimum is lower, or less
-    ends = _minimise_each(residuals, starts)
+    ends = _minimise_each(residuals, starts, tuple(elements))
     theta, jacobian = ends.theta, ends.jacobian
     cost = np.where(np.isfinite(ends.cost), ends.cost, np.inf)
     order = np.argsort(cost)
@@ -75,5 +86,5 @@ def minimise_many(
 
 
 @jit
-def _minimise_each(residuals: Callable[..., Any], starts: Array) -> Minimum:
-    return jax.vmap(lambda start: minimise(residuals, start))(starts)
+def _minimise_each(residuals: Callable[..., Any], starts: Array, elements: tuple[int, ...]) -> Minimum:
+    return jax.vmap(lambda start: minimise(residuals, start, elements=elements))(starts)

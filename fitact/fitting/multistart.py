@@ -50,7 +50,7 @@ def find_optima(solution: LeastSquaresResult, count: int, draws_per_start: int =
     tables = [channel.compression for channel in likelihood.channels if channel.compression is not None]
     within_tables = np.all([np.ones(len(draws), bool), *(table.covers(slowest) for table in tables)], axis=0)
     starts = np.vstack([solution.theta, draws[within_tables][: count - 1]])
-    return minimise_many(jax.tree_util.Partial(_residuals, likelihood, solution.sigma), starts)
+    return minimise_many(jax.tree_util.Partial(_residuals, likelihood, solution.sigma), starts, likelihood.elements)
 
 
 def _residuals(

@@ -77,7 +77,7 @@ def _fit_constrained(
             pull = weight * (model.quantities(theta)[index] - goal)
             return model.likelihood.residuals(theta, model.sigma), model.likelihood.prior_residuals(theta), pull
 
-        minimum = minimise(residuals, start, max_steps=200)
+        minimum = minimise(residuals, start, max_steps=200, elements=model.likelihood.elements)
         value = model.quantities(minimum.theta)[index]
         return minimum.theta, value, 2.0 * minimum.cost - jnp.square(weight * (value - goal))
 

@@ -22,7 +22,7 @@ from fitact.likelihood.calibration import Calibration
 from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.friction_observable import FrictionObservable
 from fitact.likelihood.observable import TIMING_NUISANCES, ChannelInputs
-from fitact.model.circuit import RC, Channel, Circuit, HighpassTerms
+from fitact.model.circuit import FINGER_PARAMETERS, RC, Channel, Circuit, HighpassTerms
 from fitact.model.force import FRICTION_PARAMETERS
 from fitact.model.skin import (
     WithSkin,
@@ -69,6 +69,14 @@ class Likelihood(eqx.Module):
     def names(self) -> tuple[str, ...]:
         """Names of the coordinates of theta."""
         return (*self.prior.names, *(channel.qualified_name(name) for channel, name in self._timing))
+
+    @property
+    def elements(self) -> tuple[int, ...]:
+        """Places of log Rsc, log Csc and log Ci in theta; empty if one is not free, or no prior holds them all."""
+        names = self.prior.names
+        if not self.use_prior or not set(FINGER_PARAMETERS) <= set(names):
+            return ()
+        return tuple(map(names.index, FINGER_PARAMETERS))
 
     @property
     def _timing(self) -> list[tuple[ChannelLikelihood, str]]:

@@ -16,8 +16,7 @@ import scipy
 from jaxtyping import Bool, Float
 
 from fitact.fitting.result import Fit
-from fitact.model.circuit import FINGER_PARAMETERS
-from fitact.sampling import divider_coordinates
+from fitact.model import divider_coordinates
 from fitact.sampling.ridge import LogDensity, Ridge, differentiate, follow_ridge
 
 Random = np.random.RandomState | np.random.Generator
@@ -91,9 +90,9 @@ class Proposal:
         decides, from `count` draws of each.
         """
         usual = cls.from_laplace(fit.point, fit.point_root, log_prob, fit.sampling_order)
-        if usual.is_normal or fit.sampling_order or not set(FINGER_PARAMETERS) <= set(fit.point_names):
+        elements = fit.likelihood.elements
+        if usual.is_normal or fit.sampling_order or not elements:
             return usual
-        elements = [fit.point_names.index(name) for name in FINGER_PARAMETERS]
         point = divider_coordinates.from_elements(fit.point, elements)
         root = divider_coordinates.differentiate(fit.point, elements) @ fit.point_root
 
@@ -168,7 +167,7 @@ class Proposal:
         for i, table in self.tables.items():
             z[:, i] = np.where(tabulated, table.draw(random, count), z[:, i])
         points = self._bend(self.origin + z)[0]
-        return divider_coordinates.to_elements(points, self.elements) if self.elements else points
+        return divider_coordinates.to_elements(points, self.elements)
 
     def _bend(self, z: Float[np.ndarray, "count n"]) -> tuple[np.ndarray, Float[np.ndarray, " count"]]:
         """Return the points of coordinates without bends, and the logarithm of the change of volume."""
@@ -180,7 +179,7 @@ class Proposal:
 
     def log_density(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, " count"]:
         """Return the logarithm of the density, up to a constant."""
-        points = divider_coordinates.from_elements(points, self.elements) if self.elements else points
+        points = divider_coordinates.from_elements(points, self.elements)
         z = np.linalg.solve(self.axes, (points - self.center).T).T
         log_volume = np.zeros(len(z))
         for ridge in self.ridges:

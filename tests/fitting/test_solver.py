@@ -87,6 +87,41 @@ def test_a_parameter_without_effect_is_rank_deficient():
     assert result_name(end.result) == "rank_deficient"
 
 
+def admittance_residuals(theta: Array, xp) -> Array:
+    """Return residuals of the current of one sine, which leaves a curved valley of Rsc, Csc and Ci, and of a prior."""
+
+    def admittance(theta: Array) -> Array:
+        Rsc, Csc, Ci = (xp.exp(theta[i]) for i in range(3))
+        s = 200j * np.pi
+        return 1.0 / (1.0 / (s * Ci) + 2.0 * Rsc / (1.0 + s * Rsc * Csc))
+
+    expected = admittance(np.log([160e3, 22e-9, 1.35e-9]))
+    off = (admittance(theta) - expected) / (1e-4 * abs(expected))
+    return xp.concatenate(
+        [xp.stack([off.real, off.imag]), (theta - np.log([300e3, 10e-9, 1e-9])) / np.array([2.0, 1.5, 0.5])]
+    )
+
+
+def test_coordinates_lead_along_a_curved_valley():
+    """Logarithms of Rsc, Csc and Ci take three times as many steps."""
+    start = np.log([59e3, 60e-9, 1.8e-9])
+    straight, bent = (
+        minimum.minimise(functools.partial(admittance_residuals, xp=jnp), start, elements=elements)
+        for elements in ((0, 1, 2), ())
+    )
+    oracle = scipy.optimize.least_squares(
+        admittance_residuals, start, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-12, kwargs={"xp": np}
+    )
+    for end in (straight, bent):
+        assert result_name(end.result) == "successful"
+        assert float(end.cost) == pytest.approx(oracle.cost, rel=1e-9)
+        # the curvature along the valley is that of the prior
+        errors = np.linalg.norm(np.linalg.inv(np.asarray(end.jacobian)[2:]), axis=1)
+        assert np.max(np.abs(np.asarray(end.theta) - oracle.x) / errors) < 1e-3
+        np.testing.assert_allclose(end.jacobian, oracle.jac, rtol=1e-4, atol=1e-4 * np.max(np.abs(oracle.jac)))
+    assert 2 * int(straight.steps) < int(bent.steps)
+
+
 def test_no_step_helps():
     """A derivative of the wrong sign: no trial step is accepted."""
 

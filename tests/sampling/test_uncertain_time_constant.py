@@ -9,7 +9,7 @@ import pytest
 import scipy.stats
 
 import fitact
-from fitact.sampling import divider_coordinates
+from fitact.model import divider_coordinates
 from fitact.sampling.proposal import Proposal
 
 RATE = 100e3  # Hz
@@ -145,7 +145,7 @@ def test_a_proposal_follows_a_delay_that_bends_with_b():
     fit = SimpleNamespace(
         point=point,
         point_root=np.linalg.solve(divider_coordinates.differentiate(point, [0, 1, 2]), root),
-        point_names=("Rsc", "Csc", "Ci", "delay"),
+        likelihood=SimpleNamespace(elements=(0, 1, 2)),
         sampling_order=[],
     )
     proposal = Proposal.from_fit(fit, log_density)
