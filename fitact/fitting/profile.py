@@ -111,7 +111,7 @@ def profile_intervals(laplace: Laplace, names: Sequence[str], level: float, prio
 
 
 def compare_with_normal(laplace: Laplace, name: str, z: float) -> tuple[float, float]:
-    """Return how many standard deviations the data hold `z` of them below and above the optimum for.
+    """Return as how many standard deviations `z` of them count, below and above the optimum.
 
     These are roots of the deviance of the profile of one of `PROFILE_QUANTITIES`: `z` if its posterior is normal.
     """

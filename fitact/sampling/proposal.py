@@ -83,7 +83,7 @@ class Proposal:
 
     @classmethod
     def from_fit(cls, fit: Fit, log_prob: LogDensity, count: int = 1000) -> Self:
-        """Build a proposal around a fit, in those of three sets of coordinates that serve best.
+        """Build a proposal around a fit, in that of three sets of coordinates which serves best.
 
         If the posterior is not normal, it may be curved in several ways. It is then described along the time constant
         first, along principal axes in the same coordinates, or in the elements. The variance of importance weights
