@@ -129,9 +129,16 @@ def run_ensembles(
     return run.chain, convergence
 
 
-def make_moves(proposal: Proposal, independent: float = 0.85) -> list[tuple[emcee.moves.Move, float]]:
-    """Return emcee's moves with their weights: a fraction `independent` draws from the proposal, others stretch."""
-    return [(emcee.moves.MHMove(proposal.move), independent), (emcee.moves.StretchMove(), 1.0 - independent)]
+def make_moves(
+    proposal: Proposal, independent: float = 0.85, alternative: float = 0.05
+) -> list[tuple[emcee.moves.Move, float]]:
+    """Return emcee's moves with their weights: a fraction `independent` draws from the proposal, others stretch.
+
+    A fraction `alternative` draws from each alternative instead, which frees walkers where the proposal is too low.
+    """
+    others = [(emcee.moves.MHMove(each.move), alternative) for each in proposal.alternatives]
+    first = independent - alternative * len(others)
+    return [(emcee.moves.MHMove(proposal.move), first), *others, (emcee.moves.StretchMove(), 1.0 - independent)]
 
 
 def reject_nonfinite(log_prob: LogDensity) -> LogDensity:

@@ -80,6 +80,7 @@ class Proposal:
     tables: dict[int, TabulatedMarginal] = dataclasses.field(default_factory=dict)
     student_share: float = 0.1  # fraction drawn from the Student-t alone, so that the support has no bounds
     elements: Sequence[int] = ()
+    alternatives: Sequence[Self] = ()  # proposals that may reach where this one does not
 
     @classmethod
     def from_fit(cls, fit: Fit, log_prob: LogDensity, count: int = 1000) -> Self:
@@ -87,7 +88,7 @@ class Proposal:
 
         If the posterior is not normal, it may be curved in several ways. It is then described along the time constant
         first, along principal axes in the same coordinates, or in the elements. The variance of importance weights
-        decides, from `count` draws of each.
+        decides, from `count` draws of each. The others are its `alternatives`.
         """
         usual = cls.from_laplace(fit.point, fit.point_root, log_prob, fit.sampling_order)
         elements = fit.likelihood.elements
@@ -109,7 +110,8 @@ class Proposal:
         log_ratios = log_prob(points) - np.stack([each.log_density(points) for each in found])
         # weights of the draws of all, in whose sum over a proposal what it misses counts most
         log_weights = -scipy.special.logsumexp(-log_ratios, axis=0)
-        return found[int(np.argmin(scipy.special.logsumexp(log_ratios + log_weights, axis=1)))]
+        best = found.pop(int(np.argmin(scipy.special.logsumexp(log_ratios + log_weights, axis=1))))
+        return dataclasses.replace(best, alternatives=found)
 
     @property
     def is_normal(self) -> bool:
