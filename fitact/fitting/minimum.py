@@ -5,7 +5,7 @@ program from the disk does without optimistix.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -24,7 +24,7 @@ def minimise(
     start: Float[Array, " parameters"],
     max_steps: int = 300,
     damping: ArrayLike = 1e-2,
-    elements: Sequence[int] = (),
+    elements: tuple[int, ...] = (),
 ) -> Minimum:
     """Find the least-squares optimum nearest to `start`; pure, for use within jit and vmap, in double precision.
 
@@ -34,10 +34,10 @@ def minimise(
     """
     from fitact.fitting.levenberg_marquardt import find_minimum
 
-    def transformed(point: Array) -> PyTree[Array]:
+    def evaluate(point: Array) -> PyTree[Array]:
         return residuals(to_elements(point, elements))
 
-    end = find_minimum(transformed, from_elements(jnp.asarray(start), elements), max_steps, damping)
+    end = find_minimum(evaluate, from_elements(jnp.asarray(start), elements), max_steps, damping)
     theta = to_elements(end.theta, elements)
     return dataclasses.replace(end, theta=theta, jacobian=end.jacobian @ differentiate(theta, elements))
 
@@ -54,12 +54,12 @@ class Optima(NamedTuple):
 def minimise_many(
     residuals: Callable[[Float[Array, " parameters"]], PyTree[Float[Array, "..."]]],
     starts: Float[np.ndarray, "starts parameters"],
-    elements: Sequence[int] = (),
+    elements: tuple[int, ...] = (),
 ) -> Optima:
     """Minimise from all starts at once; with residuals in units of their sd, the cost is -log(probability)."""
     same_optimum = 0.1  # standard errors, below which end points count as one optimum
     log_density_margin = 3.0  # by which the log-probability of a competing optimum is lower, or less
-    ends = _minimise_each(residuals, starts, tuple(elements))
+    ends = _minimise_each(residuals, starts, elements)
     theta, jacobian = ends.theta, ends.jacobian
     cost = np.where(np.isfinite(ends.cost), ends.cost, np.inf)
     order = np.argsort(cost)

@@ -118,12 +118,12 @@ def compare_with_normal(laplace: Laplace, name: str, z: float) -> tuple[float, f
     index, sd = PROFILE_QUANTITIES.index(name), laplace.derived_log_sd[DERIVED_NAMES.index(name)]
     with double_precision():
         model = ConstrainedFit(laplace.likelihood.without_samples(), jnp.asarray(laplace.sigmas), laplace.derive)
-        weight = np.array([0.0, 0.0, 20.0 / sd, 20.0 / sd])
+        side, rows = np.array([0.0, -1.0, 1.0]), np.full(3, index)  # the first is the optimum, without a pseudo-datum
         center = float(laplace.log_derived[0][DERIVED_NAMES.index(name)])
-        goal, points = center + z * sd * np.array([0.0, 0.0, -1.0, 1.0]), np.tile(laplace.theta, (4, 1))
-        _, value, deviance = map(np.asarray, _fit_constrained(model, np.full(4, index), goal, weight, points))
-    distance = np.abs(value[2:] - value[0]) / (z * sd)  # slightly less than 1
-    low, high = np.sqrt(np.maximum(deviance[2:] - deviance[0], 0.0)) / distance
+        goal, weight, points = center + z * sd * side, 20.0 / sd * np.abs(side), np.tile(laplace.theta, (3, 1))
+        _, value, deviance = map(np.asarray, _fit_constrained(model, rows, goal, weight, points))
+    distance = np.abs(value[1:] - value[0]) / (z * sd)  # slightly less than 1
+    low, high = np.sqrt(np.maximum(deviance[1:] - deviance[0], 0.0)) / distance
     return float(low), float(high)
 
 

@@ -287,7 +287,8 @@ def certify(
     if all(channel.compression is None for channel in likelihood.channels):
         return CertifiedLikelihood(likelihood, None, tuple(r or _TIMING_REASON for r in reasons))
     light, optimum = likelihood.without_samples(), likelihood.evaluate_circuit(theta)
-    reach = table_half_width(np.linalg.norm(_log_tau_slopes(light, theta) @ covariance_factor, axis=1))
+    log_tau_sd = np.linalg.norm(_log_tau_slopes(light, theta) @ covariance_factor, axis=1)
+    reach, least_reach = table_half_width(log_tau_sd), table_half_width(log_tau_sd, 6.0, 0.015)
     precisions = table_precision(sigma, tolerance).tolist()
     inputs = [likelihood.make_inputs(optimum.circuit, theta, channel) for channel in likelihood.channels]
     delay_sd = dict(zip(likelihood.names, np.linalg.norm(covariance_factor, axis=1), strict=True))
@@ -318,7 +319,7 @@ def certify(
     differences -= np.where(is_expanded, differences[0], 0.0)
     # where the density is far from normal, some of the points around the optimum are far from it in log-likelihood
     errors = np.max((np.abs(differences) - 1e-6 * np.abs(exact - exact[0]))[: len(around)], axis=0)
-    ends = [optimum.tau * np.exp(side * 0.3 * reach) for side in (-1.0, 1.0)]  # six standard deviations
+    ends = [optimum.tau * np.exp(side * least_reach) for side in (-1.0, 1.0)]
     for i, channel in enumerate(likelihood.channels):
         if not (is_expanded[i] or _is_wide(channel) or all(_covers(channel, tau) for tau in ends)):
             errors[i] = np.nan  # a wider table serves more draws

@@ -49,10 +49,9 @@ SCENE = fitact.Scene.from_dict(
 def log_posterior(record: fitact.Record, log_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the log-density of log b at the best g, delay, offset and charge for each, and its integral over these.
 
-    The waves are those of least squares in V, whose noise is small against that of Vsc.
-
-    Offset and charge may be ten times as large as Vsc. The priors of Rsc, Csc and Ci are normal in the logarithms. g,
-    which the record determines, joins Csc and Ci.
+    The waves are those of least squares in V, whose noise is small against that of Vsc. Offset and charge may be ten
+    times as large as Vsc. The priors of Rsc, Csc and Ci are normal in the logarithms. g, which the record determines,
+    joins Csc and Ci.
     """
     time, Vsc, (omega, _) = record.time, record["Vsc"], TONES
     used = slice(6, -6)  # a fit leaves out what may respond to V before or after the record
@@ -65,9 +64,8 @@ def log_posterior(record: fitact.Record, log_b: np.ndarray) -> tuple[np.ndarray,
             gain = transfer(omega, g, b) * np.exp(-1j * omega * delay)
             signal, slope = ((each @ waves).real for each in (gain, -1j * omega * gain))
             columns = np.stack([signal, slope / RATE, np.ones_like(time), np.exp(-time / b)], axis=1)[used]
-            columns = np.vstack(
-                [columns, 0.02 / (10.0 * np.ptp(Vsc)) * np.eye(4)[2:]]
-            )  # their prior, for noise of 0.02 V
+            # with rows of the priors of offset and charge, for noise of 0.02 V
+            columns = np.vstack([columns, 0.02 / (10.0 * np.ptp(Vsc)) * np.eye(4)[2:]])
             sizes, (squares[i],), *_ = np.linalg.lstsq(columns, np.append(Vsc[used], [0.0, 0.0]), rcond=None)
             g, delay = g * sizes[0], delay + sizes[1] / RATE
         log_determinants[i] = np.linalg.slogdet(columns.T @ columns)[1]
