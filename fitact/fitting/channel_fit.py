@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Bool, Float
 
 from fitact.compiled import jit
@@ -121,7 +122,7 @@ class ChannelFit:
             linear=linear,
             residuals=residuals,
             weight=weight,
-            log_likelihood=_log_likelihood(channel, residuals, white, sigma),
+            log_likelihood=log_likelihood(channel, residuals, white, sigma),
             figures=figures,
             full_because=reason,
             white=of_steps,
@@ -177,44 +178,19 @@ def _channel_gain(circuit: Circuit, channel: Channel, omega: Array) -> Array:
     return circuit.channel_gain(channel, omega)
 
 
-def _log_likelihood(
-    channel: ChannelLikelihood, residuals: np.ndarray, white_residuals: np.ndarray, sigma: float
-) -> float:
+def log_likelihood(channel: ChannelLikelihood, residuals: Samples, white: Samples, sigma: float) -> float:
     """Return the log-likelihood at its maximum over the noise sd; under Student's t, at scale `sigma`."""
-    samples = channel.samples
-    if samples.charges is not None:
-        gain = np.asarray(samples.charges.gain)[samples.likelihood_mask]
-        return gaussian_log_likelihood(white_residuals, None) + float(np.sum(np.log(gain)))
-    if samples.whitening is None:
-        weights = samples.weights[: residuals.size]
-        if channel.noise == "student":
-            return _student_log_likelihood(residuals, weights, sigma)
-        return gaussian_log_likelihood(residuals, weights)
-    scale = (samples.weights * samples.whitening.scale)[samples.likelihood_mask]
-    return gaussian_log_likelihood(white_residuals, None) + float(np.sum(np.log(scale)))
+    mask = channel.samples.likelihood_mask
+    scale = channel.samples.scale[mask]
+    if channel.noise == "student":
+        z = residuals[mask[: residuals.size]] * scale / sigma
+        return float(np.sum(scipy.stats.t.logpdf(z, STUDENT_DOF) + np.log(scale / sigma)))
+    return _gaussian_log_likelihood(white) + float(np.sum(np.log(scale)))
 
 
-def gaussian_log_likelihood(residuals: Samples, weight: Samples | None) -> float:
-    """Return the Gaussian log-likelihood of residuals at its maximum over the noise sd, including all constants.
-
-    `weight` is the inverse relative noise sd of each sample; 0 excludes a sample, and None means equal weights.
-    """
-    weight = np.ones(residuals.size) if weight is None else weight
-    used = weight > 0.0
-    mean = float(np.mean(np.square(residuals[used] * weight[used])))
-    size = int(np.count_nonzero(used))
-    return -0.5 * size * (math.log(2.0 * math.pi * max(mean, 1e-300)) + 1.0) + float(np.sum(np.log(weight[used])))
-
-
-def _student_log_likelihood(residuals: Samples, weight: Samples, scale: float) -> float:
-    """Return the log-likelihood of residuals under Student's t with `STUDENT_DOF` degrees of freedom and this scale."""
-    used = weight > 0.0
-    z = residuals[used] * weight[used] / scale
-    constant = (
-        math.lgamma(0.5 * (STUDENT_DOF + 1.0)) - math.lgamma(0.5 * STUDENT_DOF) - 0.5 * math.log(STUDENT_DOF * math.pi)
-    )
-    densities = constant - 0.5 * (STUDENT_DOF + 1.0) * np.log1p(z**2 / STUDENT_DOF) + np.log(weight[used] / scale)
-    return float(np.sum(densities))
+def _gaussian_log_likelihood(residuals: Samples) -> float:
+    """Return the Gaussian log-likelihood of residuals at its maximum over the noise sd, including all constants."""
+    return -0.5 * residuals.size * (math.log(2.0 * math.pi * max(float(np.mean(residuals**2)), 1e-300)) + 1.0)
 
 
 @jit

@@ -17,7 +17,7 @@ from fitact.prior.distributions import LogNormal, Uniform
 from fitact.problem.instrument_errors import UNRESOLVED_V, ErrorCoordinate, InstrumentError
 from fitact.scene.assumptions import states_Ci
 from fitact.scene.scene import Scene
-from fitact.uncertainty.budget import Component, ErrorSource
+from fitact.uncertainty.budget import Component
 from fitact.uncertainty.effect_size import EffectSizes
 from fitact.units import format_engineering
 
@@ -34,7 +34,7 @@ _MEASURE = {
 
 def list_error_sources(
     likelihood: Likelihood, coordinates: Sequence[ErrorCoordinate], scene: Scene
-) -> tuple[tuple[ErrorSource, ...], ...]:
+) -> tuple[tuple[Component, ...], ...]:
     """Return the sources of error of each coordinate of theta."""
     by_name = {each.name: each for each in coordinates}
     load, plates, sources = scene.find_load(), scene.plates(), []
@@ -49,13 +49,14 @@ def list_error_sources(
             continue
         if name in timing_sd:
             remedy = _MEASURE[name.partition("_")[0]]
-            sources.append((ErrorSource(f"prior of the {name}", LogNormal(1.0, timing_sd[name]), remedy),))
+            sources.append((Component.from_prior(f"prior of the {name}", LogNormal(1.0, timing_sd[name]), remedy),))
             continue
         label, remedy = f"prior of {name}", _MEASURE.get(name, "state a narrower prior, if you know more")
         if load is not None and name in loads:
             label = f"input {name.removeprefix('probe_')} ({load.name})"
         origin = "default Ci" if name == "Ci" and not states_Ci(scene) else ""
-        sources.append((ErrorSource(label, likelihood.prior[name], remedy, is_shared=name in loads, origin=origin),))
+        component = Component.from_prior(label, likelihood.prior[name], remedy, is_shared=name in loads, origin=origin)
+        sources.append((component,))
     return tuple(sources)
 
 
@@ -116,10 +117,11 @@ def list_unstated_errors(gains: Mapping[str, float], stray: float) -> tuple[Unst
     return tuple(errors)
 
 
-def _instrument_source(error: InstrumentError) -> ErrorSource:
+def _instrument_source(error: InstrumentError) -> Component:
     is_own = error.source.startswith(UNRESOLVED_V)
     origin = "rounding of V" if is_own else "instruments"
-    return ErrorSource(error.source, error.distribution, _CALIBRATE, error.power, not is_own, origin)
+    factor = error.source, error.distribution, _CALIBRATE, error.power
+    return Component.from_prior(*factor, is_shared=not is_own, origin=origin)
 
 
 def noise_information(

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.compiled import double_precision
-from fitact.experiment.blind_directions import STRAY, blind_directions, gain_names, name_direction
+from fitact.experiment.blind_directions import blind_directions, gain_names, name_direction
 from fitact.experiment.experiment import CandidateDesign, DesignOption
 from fitact.experiment.fisher import Experiment
 from fitact.experiment.options import NEEDS, suggest_measurements
@@ -152,28 +152,6 @@ class Identifiability:
         )
 
 
-def assess_identifiability(
-    names: Sequence[str],
-    covariance_factor: Float[np.ndarray, "parameters parameters"],
-    prior_factor: Float[np.ndarray, "parameters parameters"],
-    force_gradient: Float[np.ndarray, " parameters"],
-    experiment: Experiment,
-    unchanged: tuple[float, float, str] = (0.0, 0.0, ""),
-) -> Identifiability:
-    """Assess the identifiability of a fit, from factors of its covariance and of the prior covariance.
-
-    `names` are the coordinates of theta. The free parameters of `experiment` are assessed, except gains and a stray
-    capacitance, which are nuisances with priors of their own. `force_gradient`: gradient of the log mean force in
-    theta. `unchanged` is that of the result.
-    """
-    free = [name for name in experiment.free if name not in (*gain_names(experiment.channels), STRAY)]
-    factors = covariance_factor, prior_factor
-    judgement = assess_parameters(names, *factors, force_gradient, free, experiment.channels, unchanged)
-    root = covariance_factor[[list(names).index(name) for name in experiment.free]]
-    gradient = _regress(covariance_factor.T @ force_gradient, root)
-    return dataclasses.replace(judgement, experiment=experiment, force_gradient=gradient)
-
-
 def _regress(deviate: Float[np.ndarray, " n"], roots: Float[np.ndarray, "parameters n"]) -> np.ndarray:
     """Return how a quantity follows some of the parameters when all others take their expected values.
 
@@ -183,19 +161,28 @@ def _regress(deviate: Float[np.ndarray, " n"], roots: Float[np.ndarray, "paramet
     return np.linalg.lstsq((roots / sd[:, None]).T, deviate, rcond=None)[0] / sd
 
 
-def assess_parameters(
+def assess_identifiability(
     names: Sequence[str],
     covariance_factor: Float[np.ndarray, "parameters parameters"],
     prior_factor: Float[np.ndarray, "parameters parameters"],
     force_gradient: Float[np.ndarray, " parameters"],
     free: Sequence[str],
     channels: tuple[str, ...],
+    experiment: Experiment | None = None,
     unchanged: tuple[float, float, str] = (0.0, 0.0, ""),
 ) -> Identifiability:
-    """Assess the parameters `free` among `names`, without suggested measurements."""
+    """Assess the identifiability of a fit, from factors of its covariance and of the prior covariance.
+
+    `names` are the coordinates of theta. The parameters `free` are assessed; gains and a stray capacitance are
+    nuisances with priors of their own. `force_gradient`: gradient of the log mean force in theta. Without the
+    `experiment` no measurements are suggested. `unchanged` is that of the result.
+    """
     shares, blind, along = information_directions(names, covariance_factor, prior_factor, free)
     direction = dict(zip(free, map(float, blind), strict=True))
-    force_sd = float(np.linalg.norm(covariance_factor.T @ force_gradient))
+    deviate, gradient = covariance_factor.T @ force_gradient, None
+    if experiment is not None:
+        gradient = _regress(deviate, covariance_factor[[list(names).index(name) for name in experiment.free]])
+    force_sd = float(np.linalg.norm(deviate))
     return Identifiability(
         verdict=str(verdicts(shares, along)),
         eigenvalues=tuple(map(float, shares)),
@@ -206,6 +193,8 @@ def assess_parameters(
         force_sd=force_sd,
         force_contraction=1.0 - force_sd / float(np.linalg.norm(prior_factor.T @ force_gradient)),
         channels=channels,
+        experiment=experiment,
+        force_gradient=gradient,
         unchanged=unchanged,
     )
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from fitact.fitting.minimum import minimise, result_name
 from fitact.fitting.score_test import explained_squares
 from fitact.fitting.timing import clock_r_squared, free_timing
 from fitact.likelihood.certificate import can_interpolate, expand_student, interpolate_channel, recompress
-from fitact.likelihood.channel import ChannelLikelihood
+from fitact.likelihood.channel import ChannelLikelihood, compiled_fit_nuisances
 from fitact.likelihood.compression import HUM_FREQUENCIES, Interpolation
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.noise import NoiseModel, fit_ar1, student_curvature, student_weight
@@ -64,23 +64,6 @@ class LeastSquaresResult:
         return UnknownCharges.from_nuisances(self.likelihood, self.theta, self.nuisances[0], self.jacobian[0][first:])
 
 
-class _Round(NamedTuple):
-    """End of a round; the fields are those of `LeastSquaresResult`."""
-
-    theta: Array
-    sigma: Array
-    log_density: Array
-    result: Array  # index in `RESULT_NAMES`
-    steps: Array
-    prior: tuple[Array, Array]
-    jacobian: tuple[Array, ...]
-    nuisances: tuple[Array, ...]
-    residuals: tuple[Array, ...]
-    shapes: tuple[Array, ...]
-    slope: tuple[Array, ...]
-    signal: tuple[Array, ...]
-
-
 def least_squares(
     likelihood: Likelihood, start: np.ndarray, noise: np.ndarray, noise_tolerance: float = 0.01, max_rounds: int = 6
 ) -> LeastSquaresResult:
@@ -91,18 +74,19 @@ def least_squares(
     reduced, steps = likelihood.without_samples(), 0
     theta, sigma = start, noise
     for damping in [1e-2, *[1e-9] * (max_rounds - 1)]:  # later rounds start at the optimum of another noise
-        solved = _solve_round(reduced, theta, sigma, np.asarray(damping))
+        solved = LeastSquaresResult(likelihood, *_solve_round(reduced, theta, sigma, np.asarray(damping)))
         change = np.max(np.abs(solved.sigma / sigma - 1.0))
         theta, sigma, steps = solved.theta, solved.sigma, steps + int(solved.steps)
         if not change > noise_tolerance:
             break
-    end = solved._asdict() | {"steps": steps, "result": result_name(solved.result)}
-    end["log_density"] = float(solved.log_density)
-    return LeastSquaresResult(likelihood, **end)
+    log_density, result = float(solved.log_density), result_name(solved.result)
+    return dataclasses.replace(solved, log_density=log_density, result=result, steps=steps)
 
 
 @jit
-def _solve_round(likelihood: Likelihood, start: Array, sigma: Array, damping: Array) -> _Round:
+def _solve_round(likelihood: Likelihood, start: Array, sigma: Array, damping: Array) -> tuple[Any, ...]:
+    """Return the fields of `LeastSquaresResult` after the likelihood, with the index of the result."""
+
     def with_prior(theta: Array) -> tuple[Any, Array]:
         return likelihood.residuals(theta, sigma), likelihood.prior_residuals(theta)
 
@@ -127,7 +111,7 @@ def _solve_round(likelihood: Likelihood, start: Array, sigma: Array, damping: Ar
     off_prior = likelihood.prior_residuals(theta)
     prior = off_prior, minimum.jacobian[len(minimum.jacobian) - off_prior.size :]
     end = theta, jnp.stack(noise), log_density, minimum.result, minimum.steps, prior, jacobians, nuisances
-    return _Round(*end, *weighted)
+    return *end, *weighted
 
 
 def _information_jacobian(
@@ -266,7 +250,7 @@ def _solve_coloured_noise(
     for i, channel in enumerate(likelihood.channels):
         if channel.noise == "ar1":
             white = channel.without_compression().replace_samples(whitening=None)
-            residuals, *_ = _fit_nuisances(white, likelihood.channel_inputs(solved.theta, i), solved.sigma[i])
+            residuals, *_ = compiled_fit_nuisances(white, likelihood.channel_inputs(solved.theta, i), solved.sigma[i])
             counted = channel.samples.weights > 0.0
             channel = channel.replace_samples(whitening=fit_ar1(residuals, counted).whitening(counted))
             channel = recompress(channel, likelihood.evaluate_circuit(solved.theta))
@@ -326,9 +310,6 @@ def _interpolate(
         channel = interpolate_channel(likelihood, i, solved.theta, root, float(solved.sigma[i]), reach)
         likelihood = likelihood.replace_channel(i, channel)
     return likelihood, solved.theta, solved.sigma
-
-
-_fit_nuisances = jit(ChannelLikelihood.fit_nuisances)
 
 
 def _add_nuisance(solution: LeastSquaresResult, index: int, name: str) -> tuple[Likelihood, np.ndarray]:

@@ -25,7 +25,7 @@ from fitact.fitting.error_sources import (
 )
 from fitact.fitting.fit_figures import plot_fit, plot_identifiability
 from fitact.fitting.geometry import Contribution
-from fitact.fitting.identifiability import Identifiability, assess_identifiability, assess_parameters
+from fitact.fitting.identifiability import Identifiability, assess_identifiability
 from fitact.fitting.laplace import Laplace
 from fitact.fitting.outcome import RESULTS
 from fitact.fitting.profile import PROFILE_QUANTITIES, Interval, profile_intervals
@@ -40,7 +40,7 @@ from fitact.problem.source import require_record
 from fitact.scene.assumptions import list_assumptions
 from fitact.scene.scene import Scene
 from fitact.tables import Display, to_dataframe
-from fitact.uncertainty.budget import Budget, ErrorSource, laplace_components
+from fitact.uncertainty.budget import Budget, Component, laplace_components
 from fitact.uncertainty.effect_size import NO_EFFECTS, EffectSizes
 from fitact.units import quantity_unit
 
@@ -82,7 +82,7 @@ class Fit(Display):
     traces: tuple[ChannelFit, ...]
     compression_error: float | None
     experiment: Experiment | None
-    error_sources: tuple[tuple[ErrorSource, ...], ...]
+    error_sources: tuple[tuple[Component, ...], ...]
     noise_information: dict[str, Float[np.ndarray, "rows parameters"]]
     gain_shifts: dict[str, Float[np.ndarray, " parameters"]]
     stray_changes: dict[str, float]
@@ -143,12 +143,10 @@ class Fit(Display):
             self.likelihood.prior_factor,
             self.laplace.log_gradient("force_mean"),
         )
-        unchanged = self.unchanged_force_u()
-        if self.experiment is not None:
-            return assess_identifiability(*evidence, self.experiment, unchanged)
         free = [name for name in self.names if name in circuit_parameters(self.likelihood.template)]
         channels = tuple(dict.fromkeys(trace.channel for trace in self.traces))
-        return assess_parameters(*evidence, free, channels, unchanged)
+        channels = channels if self.experiment is None else self.experiment.channels
+        return assess_identifiability(*evidence, free, channels, self.experiment, self.unchanged_force_u())
 
     def _summarize(self, name: str, value: float, log_sd: float) -> summary.Summary:
         """Summarize a positive quantity, with the shape of the distributions of its sources of error."""

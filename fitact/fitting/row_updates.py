@@ -13,7 +13,7 @@ from fitact.data.record import Record
 from fitact.fitting.channel_fit import sample_residuals
 from fitact.fitting.least_squares import LeastSquaresResult
 from fitact.fitting.timing import free_timing
-from fitact.likelihood.channel import ChannelLikelihood
+from fitact.likelihood.channel import ChannelLikelihood, compiled_fit_nuisances, compiled_signal
 from fitact.likelihood.charge_rows import MAX_STEPS, ChargeRows
 from fitact.likelihood.compression import HUM_FREQUENCIES
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
@@ -56,7 +56,7 @@ def update_rows(likelihood: Likelihood, solution: LeastSquaresResult, sources: S
                 inputs = dataclasses.replace(inputs, delay=delay)
                 channel = _update_drive(channel, inputs, sigma, optimum, record)
             else:
-                beta = np.asarray(_fit_nuisances(solved, inputs, sigma)[1])
+                beta = np.asarray(compiled_fit_nuisances(solved, inputs, sigma)[1])
                 sizes = beta * np.asarray(solved.linear_sd)[list(solved.columns)]
                 channel = dataclasses.replace(channel, linear_sd=_expect_harmonics(solved, sizes))
                 channel = set_rows(channel, *_rows_at(solved, inputs, sizes, record))
@@ -75,7 +75,7 @@ def _update_drive(
     whole = dataclasses.replace(late, delay=np.asarray(steps * step - shift), stray=None)
 
     def respond(V: Rows, inputs: ChannelInputs) -> Rows:
-        return np.asarray(_respond(replace_drive(full, record, V, np.zeros(size)), inputs))[:size]
+        return np.asarray(compiled_signal(replace_drive(full, record, V, np.zeros(size)), inputs))[:size]
 
     # a delay by whole steps does not smooth the noise of V
     rise = np.diff(current.V - current.smooth, prepend=0.0) / step
@@ -143,7 +143,3 @@ def _modelled_rows(channel: ChannelLikelihood, inputs: ChannelInputs, sizes: Arr
     """Return the rows of the signal of a channel that observed 0, and those of nuisances of these sizes."""
     rows, shapes = channel.rows_and_shapes(inputs)
     return -rows, sizes @ shapes
-
-
-_respond = jit(ChannelLikelihood.signal)
-_fit_nuisances = jit(ChannelLikelihood.fit_nuisances)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from fitact.compiled import BatchEvaluator, jit, pad_samples
-from fitact.likelihood.channel import ChannelLikelihood
+from fitact.likelihood.channel import ChannelLikelihood, compiled_fit_nuisances, compiled_signal
 from fitact.likelihood.compression import BASELINE_NAMES, Compression, GridCompression
 from fitact.likelihood.friction_observable import FrictionObservable
 from fitact.likelihood.interpolation import interpolate
@@ -81,7 +81,7 @@ def compress_channel(
     if isinstance(circuit, WithSkin):
         channel = fold(channel)
         inputs = ChannelInputs(circuit, np.asarray(1.0), np.asarray(0.0), np.asarray(0.0))
-        signal = _signal(channel, inputs)[part]
+        signal = compiled_signal(channel, inputs)[part]
         slope = -np.gradient(signal, time)
         compression = compress(drive, time, observed, expected_terms=terms, slope=slope, **how)
         fields = {field.name: getattr(compression, field.name) for field in dataclasses.fields(compression)}
@@ -97,9 +97,6 @@ def compress_channel(
     short = channel.count_short(start.tau)
     compression = compress(drive, time, observed, expected_terms=terms.without_fastest(short), **how)
     return dataclasses.replace(channel, compression=dataclasses.replace(compression, short=short)), ""
-
-
-_signal = jit(ChannelLikelihood.signal)
 
 
 def fold(channel: ChannelLikelihood) -> ChannelLikelihood:
@@ -175,7 +172,7 @@ def expand_student(
         likelihood.channel_inputs(theta, index),
         likelihood.evaluate_circuit(theta),
     )
-    _, beta, _ = _fit_nuisances(channel, inputs, np.asarray(sigma))
+    _, beta, _ = compiled_fit_nuisances(channel, inputs, np.asarray(sigma))
     size, full = channel.samples.size, channel.without_compression()
     residuals = (np.asarray(channel.samples.observed) - _model(full, inputs, beta))[:size]
     counted = channel.samples.weights[:size] > 0.0
@@ -203,9 +200,6 @@ def expand_student(
     observed = first - _model(changed, inputs, beta, coordinates=True)
     table = dataclasses.replace(table, observed=observed, observed_slope=slope)
     return dataclasses.replace(changed, compression=table, expansion=expansion, noise="student")
-
-
-_fit_nuisances = jit(ChannelLikelihood.fit_nuisances)
 
 
 @jit

@@ -18,7 +18,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from fitact.compiled import solve_lower
+from fitact.compiled import jit, solve_lower
 from fitact.likelihood.compression import Compression, GridCompression, Interpolation
 from fitact.likelihood.friction_observable import FrictionObservable
 from fitact.likelihood.noise import (
@@ -381,3 +381,8 @@ class ChannelLikelihood(eqx.Module):
         misfit = misfit + jnp.sum(jnp.square(beta))
         value = -0.5 * misfit - self.count * log_sigma - jnp.sum(jnp.log(jnp.diagonal(factor)))
         return value if self.compression is None else jnp.where(holds, value, jnp.nan)
+
+
+# programs for any channel
+compiled_signal = jit(ChannelLikelihood.signal)
+compiled_fit_nuisances = jit(ChannelLikelihood.fit_nuisances)

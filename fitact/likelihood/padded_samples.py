@@ -55,6 +55,13 @@ class PaddedSamples(eqx.Module):
         return (self.weights if self.whitening is None else np.asarray(self.whitening.mask)) > 0.0
 
     @property
+    def scale(self) -> Float[np.ndarray, " samples"]:
+        """Factor of each sample, or row, in its own whitened value."""
+        if self.charges is not None:
+            return np.asarray(self.charges.gain)
+        return self.weights * (1.0 if self.whitening is None else self.whitening.scale)
+
+    @property
     def count(self) -> ArrayLike:
         """Number of samples, or of rows, that count."""
         if self.charges is not None:

@@ -117,10 +117,8 @@ class _LinearisedModel(NamedTuple):
             slope = np.hstack([np.asarray(slopes[i]) @ full.prior_factor, by_nuisances]) / sigma[i]
             samples, is_student = trace.samples, trace.noise == "student"
             counts = samples.likelihood_mask
-            scale = samples.weights * (1.0 if samples.whitening is None else samples.whitening.scale)
-            scale = scale if samples.charges is None else np.asarray(samples.charges.gain)
             with np.errstate(divide="ignore"):
-                log_scale = np.where(counts, np.log(scale / sigma[i]), -np.inf)
+                log_scale = np.where(counts, np.log(samples.scale / sigma[i]), -np.inf)
             channels.append(_LinearisedChannel(np.asarray(residuals[i]) / sigma[i], slope, log_scale, is_student))
             rows = slope[mask & counts]
             # Fisher information of a sample on its location, in units of the scale

@@ -6,7 +6,6 @@ from typing import Any, Literal, TypeAlias
 
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
-from fitact.errors import InputError
 from fitact.fitting.fit import fit_records
 from fitact.fitting.result import Fit
 from fitact.model.drive import Sampled
@@ -67,8 +66,8 @@ def fit_planned(
     same = reduced.drive == scenes[0].drive and reduced.drive.model_fields_set == scenes[0].drive.model_fields_set
     fitted = fit_records(in_time, (reduced,) * len(records), drives if same else (), **options)
     if planned.left_out and fitted.result in _FAILED_RESULTS:
-        whole = _fit_full_model(in_time, scenes[0], drives, options)
-        if whole is not None and _failure_rank(whole) < _failure_rank(fitted):
+        whole = fit_records(in_time, (scenes[0],) * len(records), drives, **options)
+        if _failure_rank(whole) < _failure_rank(fitted):
             warning = (
                 f"the record contradicts the planned model, which neglects {', '.join(planned.left_out)}: only the"
                 " full model describes the record, so the full model was fitted"
@@ -107,14 +106,3 @@ def _measured_part(record: Record, choice: DriveModel, max_samples: int = 20_000
     begin = Record(record.time[:max_samples], {"V": choice.voltage[:max_samples]}, record.source)
     samples, period = whole_periods(begin)
     return Sampled(begin.time[:samples], begin["V"][:samples], period)
-
-
-def _fit_full_model(
-    records: tuple[Record, ...], scene: Scene, drives: tuple[DriveModel, ...], options: dict[str, Any]
-) -> Fit | None:
-    """Fit the full model, or return None if this version cannot fit it."""
-    try:
-        scene.require_available(fit=True)
-    except InputError:
-        return None
-    return fit_records(records, (scene,) * len(records), drives, **options)

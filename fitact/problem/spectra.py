@@ -8,9 +8,9 @@ import numpy as np
 import scipy
 from jaxtyping import Complex, Float
 
-from fitact.compiled import as_arrays, jit, pad_samples, pad_weight
+from fitact.compiled import as_arrays, pad_samples, pad_weight
 from fitact.data.spectrum import Spectrum
-from fitact.likelihood.channel import ChannelLikelihood
+from fitact.likelihood.channel import ChannelLikelihood, compiled_signal
 from fitact.likelihood.likelihood import Likelihood
 from fitact.likelihood.observable import LINEAR_NUISANCES, DriveTiming
 from fitact.likelihood.padded_samples import PaddedSamples
@@ -112,7 +112,7 @@ def update_weights(
         if isinstance(channel.observable, SpectrumObservable):
             inputs = likelihood.make_inputs(likelihood.evaluate_circuit(theta).circuit, theta, channel)
             n = channel.samples.size
-            signal, before = np.asarray(_signal(channel, inputs)), channel.samples.weights[:n]
+            signal, before = np.asarray(compiled_signal(channel, inputs)), channel.samples.weights[:n]
             taken_up = np.minimum(np.sum(influences[i][:n] ** 2, axis=1), 0.9)
             remainder = (np.asarray(channel.samples.observed) - signal)[:n] / np.sqrt(1.0 - taken_up)
             model, residuals = join_complex(signal[:n]), join_complex(remainder)
@@ -121,9 +121,6 @@ def update_weights(
             change = max(change, float(np.max(np.abs(np.log(channel.samples.weights[:n] / before)))))
             likelihood = likelihood.replace_channel(i, channel)
     return likelihood, change
-
-
-_signal = jit(ChannelLikelihood.signal)
 
 
 def _noise_sd(measurement: Measurement, size: Points, residuals: Points) -> Points:

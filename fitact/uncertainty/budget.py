@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 import scipy
@@ -17,23 +17,6 @@ from jaxtyping import Float
 
 from fitact.prior.distributions import Distribution, LogNormal
 from fitact.prior.product import multiply
-
-
-@dataclasses.dataclass(frozen=True)
-class ErrorSource:
-    """A source of error and the distribution of the factor, or of the quantity, that it makes uncertain."""
-
-    name: str
-    distribution: Distribution
-    reduce_by: str = ""  # cheapest way to reduce it
-    power: float = 1.0  # of the factor in the parameter
-    is_shared: bool = False  # whether it is the same error in all records of a session
-    origin: str = ""  # see `Component`
-
-    @functools.cached_property
-    def u(self) -> float:
-        """Standard uncertainty of the logarithm of the factor."""
-        return float(self.distribution.log_sd)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +32,11 @@ class Component:
     in_posterior: bool = True  # whether the posterior includes it
     is_shared: bool = False  # whether it is the same error in all records of a session
     origin: str = ""  # what it comes from in a few words, such as "data" or "default Ci"; "" means its source
+
+    @classmethod
+    def from_prior(cls, source: str, prior: Distribution, reduce_by: str, power: float = 1.0, **known: Any) -> Self:
+        """Return the component of the factor with this `prior`, with its power in a parameter, in that parameter."""
+        return cls(source, "B", float(prior.log_sd), power, prior, reduce_by, **known)
 
     @property
     def u(self) -> float:
@@ -182,7 +170,7 @@ def laplace_components(
     gradient: Float[np.ndarray, " parameters"],
     covariance_factor: Float[np.ndarray, "parameters parameters"],
     prior_factor: Float[np.ndarray, "parameters parameters"],
-    sources: Sequence[Sequence[ErrorSource]],
+    sources: Sequence[Sequence[Component]],
     noise: Mapping[str, Float[np.ndarray, "rows parameters"]],
 ) -> tuple[Component, ...]:
     """Return the components of a quantity whose logarithm has this `gradient` in the parameters.
@@ -196,18 +184,17 @@ def laplace_components(
     for block in _independent_blocks(precision):
         part = covariance[block]
         if len(block) > 1:
-            names = [source.name for i in block for source in sources[i]]
+            names = [each.source for i in block for each in sources[i]]
             u = math.sqrt(part @ precision[np.ix_(block, block)] @ part)
             components.append(Component(f"{' and '.join(names)} (correlated)", "B", u, 1.0))
             continue
         place, variance = block[0], 1.0 / precision[block[0], block[0]]
-        stated = sum((each.power * each.u) ** 2 for each in sources[place])
+        stated = sum(each.u**2 for each in sources[place])
         for each in sources[place]:
-            u = each.u * math.sqrt(variance / stated)  # larger than its own in a fit without prior
+            u = each.input_u * math.sqrt(variance / stated)  # larger than its own in a fit without prior
             # the product and each of its factors have the same sensitivity
-            sensitivity = float(each.power * part[0] / variance)
-            known = each.distribution, each.reduce_by, True, each.is_shared, each.origin
-            components.append(Component(each.name, "B", u, sensitivity, *known))
+            sensitivity = float(each.sensitivity * part[0] / variance)
+            components.append(dataclasses.replace(each, input_u=u, sensitivity=sensitivity))
     return tuple(components)
 
 

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -139,17 +139,13 @@ class ChannelModel:
             signal = signal + self._respond(self.parts, change=drive_sizes @ nonlinearity_shapes(self.series.voltage))
         return signal
 
-    def signal_with(self, added: Addition) -> Rows:
-        """Return the signal of a circuit with what is `added`, V or A."""
-        return self._respond(self.loop.impedances(self.values, self.s, added))
+    def signal_with(self, added: Addition = NOTHING, /, **changed: float) -> Rows:
+        """Return the signal of the circuit with what is `added`, and `changed` values of its parameters, V or A."""
+        return self._respond(self.loop.impedances({**self.values, **changed}, self.s, added))
 
-    def signal_at(self, values: Mapping[str, Any]) -> Rows:
-        """Return the signal of the circuit with other values of its parameters, V or A."""
-        return self._respond(self.loop.impedances(values, self.s))
-
-    def signal_filtered(self, gain: Callable[[Spectrum], Spectrum]) -> Rows:
+    def signal_filtered(self, gain: Spectrum) -> Rows:
         """Return the signal behind a filter, V or A."""
-        return self._respond(self.parts, gain(self.s))
+        return self._respond(self.parts, gain)
 
     def record(self, gain: Spectrum, rows: Rows, jump: float = 0.0) -> Rows:
         """Return rows after a filter, as the instrument records them."""

@@ -9,13 +9,15 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.instrument.effects import PROBE_TIME_CONSTANT
-from fitact.uncertainty.channel_series import ChannelSeries, Rows, Spectrum
+from fitact.uncertainty.channel_series import ChannelSeries, Rows
 from fitact.uncertainty.loop import Addition, ChannelModel
 
 CHANGE = "a change during the record of "  # begins the names of changes of the finger, which a track follows
 _AREA = {"Rsc": -1.0, "Csc": 1.0, "Ci": 1.0, "Ri": -1.0}
 _CHANGES = {"Rsc": {"Rsc": 1.0}, "Csc": {"Csc": 1.0}, "the contact area": _AREA}
 
+# of the mains and their harmonics, Hz
+_HUM = sorted({k * mains for mains in (50.0, 60.0) for k in range(1, 9)})
 Amplitudes = Float[np.ndarray, " amplitudes"]
 # the change of a channel by amplitudes
 Effect = Callable[[ChannelModel, Amplitudes], Rows]
@@ -36,33 +38,33 @@ def known_rivals() -> tuple[Rival, ...]:
     """Return all causes that are considered, each with its largest plausible size and the reason for it."""
     return (
         # channels of a scanning converter are sampled up to 1 / (rate x channels) apart: 20 us at 50 kHz
-        Rival("a delay", 20e-6, _filter(_delay)),
+        Rival("a delay", 20e-6, _delay),
         # an anti-alias filter or amplifier of 8 kHz and more
-        Rival("a low-pass filter", 20e-6, _filter(lambda s, a, series: 1.0 / (1.0 + a * s)), is_positive=True),
+        Rival("a low-pass filter", 20e-6, _lowpass, is_positive=True),
         # body and leads: 0.5 to 1 kohm; current-limiting resistors up to 100 kohm
-        Rival("a series resistor", 100e3, _circuit("resistor"), is_positive=True),
+        Rival("a series resistor", 100e3, functools.partial(_circuit, "resistor"), is_positive=True),
         # one passive probe of 10 Mohm || 12 pF (Tektronix: 8 to 12 pF)
-        Rival("the load of a probe", 1.5, _circuit("probe"), is_positive=True),
+        Rival("the load of a probe", 1.5, functools.partial(_circuit, "probe"), is_positive=True),
         # a few pF remain of unshielded leads after an open compensation
-        Rival("the stray capacitance of leads", 1.0, _circuit("leads")),
+        Rival("the stray capacitance of leads", 1.0, functools.partial(_circuit, "leads")),
         # a trimmer that is off by a tenth; the time constant of a passive probe is 9 Mohm x 12.2 pF
-        Rival("the compensation of a probe", 0.1, _filter(_compensation)),
+        Rival("the compensation of a probe", 0.1, _compensation),
         # the corner of an oscilloscope's AC coupling: 5 to 10 Hz; 20 Hz with a 10x probe's divider undone
-        Rival("AC coupling", 20.0, _filter(_ac_coupling), is_positive=True),
+        Rival("AC coupling", 20.0, _ac_coupling, is_positive=True),
         # palm, forearm or a wet finger: resistances differ by a factor of two
-        Rival("unequal skins", 1.0, _circuit("inequality")),
+        Rival("unequal skins", 1.0, functools.partial(_circuit, "inequality")),
         # two layers whose time constants differ by a factor of four about their mean
-        Rival("a skin of two layers", 0.4, _circuit("layers"), is_positive=True, is_certain=True),
+        Rival("a skin of two layers", 0.4, functools.partial(_circuit, "layers"), is_positive=True, is_certain=True),
         # exponents of skin in the literature: 0.75 to 1
-        Rival("a constant-phase skin", 0.25, _circuit("dispersion"), is_positive=True),
+        Rival("a constant-phase skin", 0.25, functools.partial(_circuit, "dispersion"), is_positive=True),
         # an interface gap of a few Mohm
-        Rival("an interface gap", 5.0, _circuit("gap"), is_positive=True),
+        Rival("an interface gap", 5.0, functools.partial(_circuit, "gap"), is_positive=True),
         # the conductance of skin grows by a third at the voltages of electrovibration
         Rival("a non-linear skin", 0.3, _nonlinear_skin),
         # an 8-bit converter: one step is 0.4 % of the range; 2 % for a bad one
-        *(Rival("the non-linearity of the ADC", 0.02, _adc(shape, n), n) for shape, n in _ADC_SHAPES),
+        *(Rival("the non-linearity of the ADC", 0.02, functools.partial(_adc, shape), n) for shape, n in _ADC_SHAPES),
         # hum of a tenth of the signal
-        *(Rival(f"hum at {f:g} Hz", 0.1, functools.partial(_hum, f), 2) for f in _hum_frequencies()),
+        *(Rival(f"hum at {f:g} Hz", 0.1, functools.partial(_hum, f), 2) for f in _HUM),
         # a thermal drift of 1 % of the signal
         Rival("a drift", 0.01, _drift),
         # the skin moistens, and the contact grows or shrinks, by a factor of two while a finger slides
@@ -72,39 +74,28 @@ def known_rivals() -> tuple[Rival, ...]:
     )
 
 
-def _hum_frequencies(harmonics: int = 8) -> list[float]:
-    """Return the mains frequencies and their harmonics, Hz."""
-    return sorted({k * mains for mains in (50.0, 60.0) for k in range(1, harmonics + 1)})
+def _circuit(field: str, model: ChannelModel, a: Amplitudes) -> Rows:
+    return model.signal_with(Addition(**{field: float(a[0])}))
 
 
-def _circuit(field: str) -> Effect:
-    def effect(model: ChannelModel, a: Amplitudes) -> Rows:
-        return model.signal_with(Addition(**{field: float(a[0])}))
-
-    return effect
+def _delay(model: ChannelModel, a: Amplitudes) -> Rows:
+    return model.signal_filtered(np.exp(-a[0] * model.series.difference))
 
 
-def _filter(gain: Callable[[Spectrum, float, ChannelSeries], Spectrum]) -> Effect:
-    def effect(model: ChannelModel, a: Amplitudes) -> Rows:
-        return model.signal_filtered(lambda s: gain(s, float(a[0]), model.series))
-
-    return effect
+def _lowpass(model: ChannelModel, a: Amplitudes) -> Rows:
+    return model.signal_filtered(1.0 / (1.0 + a[0] * model.s))
 
 
-def _delay(s: Spectrum, a: float, series: ChannelSeries) -> Spectrum:
-    return np.exp(-a * series.difference)
+def _compensation(model: ChannelModel, a: Amplitudes) -> Rows:
+    x = model.s * PROBE_TIME_CONSTANT
+    return model.signal_filtered(1.0 + a[0] * x / (1.0 + x))
 
 
-def _compensation(s: Spectrum, a: float, series: ChannelSeries) -> Spectrum:
-    x = s * PROBE_TIME_CONSTANT
-    return 1.0 + a * x / (1.0 + x)
-
-
-def _ac_coupling(s: Spectrum, a: float, series: ChannelSeries) -> Spectrum:
-    if series.samples.channel == "impedance":
-        return np.ones_like(s)
-    corner = 2.0 * math.pi * a
-    return np.where(s == 0.0, 0.0, s / np.where(s == 0.0, 1.0, s + corner))
+def _ac_coupling(model: ChannelModel, a: Amplitudes) -> Rows:
+    if model.series.samples.channel == "impedance":
+        return model.signal
+    s, corner = model.s, 2.0 * math.pi * a[0]
+    return model.signal_filtered(np.where(s == 0.0, 0.0, s / np.where(s == 0.0, 1.0, s + corner)))
 
 
 def _nonlinear_skin(model: ChannelModel, a: Amplitudes) -> Rows:
@@ -130,35 +121,20 @@ def _nonlinear_skin(model: ChannelModel, a: Amplitudes) -> Rows:
     return signal
 
 
-def _adc_square(x: Rows) -> Rows:
-    return x[None] ** 2
-
-
-def _adc_cube(x: Rows) -> Rows:
-    return x[None] ** 3
-
-
-def _adc_wave(x: Rows) -> Rows:
-    angle = 4.0 * math.pi * x
-    return np.stack([np.sin(angle), np.cos(angle)])
-
-
+# powers of the signal, and a wave over the range
 _ADC_SHAPES: tuple[tuple[Callable[[Rows], Float[np.ndarray, "amplitudes rows"]], int], ...] = (
-    (_adc_square, 1),
-    (_adc_cube, 1),
-    (_adc_wave, 2),
+    (lambda x: x[None] ** 2, 1),
+    (lambda x: x[None] ** 3, 1),
+    (lambda x: np.stack([np.sin(4.0 * math.pi * x), np.cos(4.0 * math.pi * x)]), 2),
 )
 
 
-def _adc(shape: Callable[[Rows], Float[np.ndarray, "amplitudes rows"]], amplitudes: int) -> Effect:
-    def effect(model: ChannelModel, a: Amplitudes) -> Rows:
-        signal = model.signal
-        if model.series.samples.omega is not None:  # the harmonics are no part of a spectrum
-            return signal
-        full_scale = 1.2 * float(np.max(np.abs(signal)))
-        return signal + full_scale * (a @ shape(signal / full_scale))
-
-    return effect
+def _adc(shape: Callable[[Rows], Float[np.ndarray, "amplitudes rows"]], model: ChannelModel, a: Amplitudes) -> Rows:
+    signal = model.signal
+    if model.series.samples.omega is not None:  # the harmonics are no part of a spectrum
+        return signal
+    full_scale = 1.2 * float(np.max(np.abs(signal)))
+    return signal + full_scale * (a @ shape(signal / full_scale))
 
 
 def _hum(frequency: float, model: ChannelModel, a: Amplitudes) -> Rows:
@@ -186,4 +162,4 @@ def _warm_up(model: ChannelModel, a: Amplitudes) -> Rows:
 def _change(powers: Mapping[str, float], model: ChannelModel, a: Amplitudes) -> Rows:
     """Return the signal if parameters of the finger, with these `powers`, go from e^-a to e^a over the record."""
     changed = {name: (model.values[name] or 0.0) * math.exp(power * float(a[0])) for name, power in powers.items()}
-    return model.signal + (model.signal_at({**model.values, **changed}) - model.signal) * _progress(model.series)
+    return model.signal + (model.signal_with(**changed) - model.signal) * _progress(model.series)

@@ -24,7 +24,13 @@ from tests.experiment.test_expected import (
 def judged(experiment: Experiment, jacobian: np.ndarray) -> Identifiability:
     root = covariance_factor(jacobian, experiment.prior_factor)
     return assess_identifiability(
-        experiment.free, root, experiment.prior_factor, derivative(scipy_log_force, 0.0)[0], experiment
+        experiment.free,
+        root,
+        experiment.prior_factor,
+        derivative(scipy_log_force, 0.0)[0],
+        experiment.free,
+        experiment.channels,
+        experiment,
     )
 
 
@@ -39,7 +45,8 @@ def test_any_order_of_coordinates_correlated_priors_and_nuisances():
     experiment = dataclasses.replace(NOMINAL, free=("Rsc", "Csc", "Ci"))
     gradient = rng.standard_normal(5)
     prior_root = np.linalg.cholesky(prior)
-    found = assess_identifiability(names, covariance_factor(jacobian, prior_root), prior_root, gradient, experiment)
+    evidence = names, covariance_factor(jacobian, prior_root), prior_root, gradient
+    found = assess_identifiability(*evidence, experiment.free, experiment.channels, experiment)
 
     data = jacobian.T @ jacobian
     known = data[np.ix_(nuisances, nuisances)] + np.linalg.inv(prior[np.ix_(nuisances, nuisances)])
@@ -103,7 +110,13 @@ def test_a_free_gain_is_named():
     jacobian = np.column_stack([vsc, scipy_vsc(*VALUES.values(), 0.0)]) / 0.1
     root = covariance_factor(jacobian, freed.prior_factor)
     found = assess_identifiability(
-        freed.free, root, freed.prior_factor, np.append(derivative(scipy_log_force, 0.0)[0], 0.0), freed
+        freed.free,
+        root,
+        freed.prior_factor,
+        np.append(derivative(scipy_log_force, 0.0)[0], 0.0),
+        NOMINAL.free,
+        freed.channels,
+        freed,
     )
     assert "free gain" in found.remedy
     assert set(found.blind_direction) == {"Rsc", "Csc", "Ci"}

@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 
 import fitact
 from fitact.cli import app
-from fitact.fitting.channel_fit import criteria, gaussian_log_likelihood
+from fitact.compiled import pad_weight
+from fitact.fitting.channel_fit import criteria, log_likelihood
 from tests.conftest import SQUARE, square_record
 
 
@@ -115,21 +116,22 @@ def test_criteria_of_a_regression_in_closed_form():
     y = 2.0 * x + 0.3 * rng.standard_normal(40)
     residuals = y - (x @ y) / (x @ x) * x
     likelihood = scipy.stats.norm.logpdf(residuals, scale=np.sqrt(np.mean(residuals**2))).sum()
-    found = criteria(gaussian_log_likelihood(residuals, None), 2, 40)
-    assert found["log_likelihood"] == pytest.approx(likelihood, rel=1e-12)
+    found = criteria(likelihood, 2, 40)
     assert found["aic"] == pytest.approx(4.0 - 2.0 * likelihood, rel=1e-12)
     assert found["aicc"] == pytest.approx(4.0 - 2.0 * likelihood + 12.0 / 37.0, rel=1e-12)
     assert found["bic"] == pytest.approx(2.0 * np.log(40.0) - 2.0 * likelihood, rel=1e-12)
 
 
-def test_log_likelihood_of_unequal_noise():
+def test_log_likelihood_of_unequal_noise(fit: fitact.Fit):
     rng = np.random.default_rng(6)
-    weight = np.array([1.0, 0.5, 0.0, 2.0, 1.0])
-    residuals = rng.standard_normal(5)
+    residuals = rng.standard_normal(fit.residuals.size)
+    weight = rng.choice([1.0, 0.5, 0.0, 2.0], residuals.size)
     kept = weight > 0.0
+    channel = fit.likelihood.channels[0].replace_samples(weight=pad_weight(weight))
     scale = np.sqrt(np.mean((residuals * weight)[kept] ** 2))
     expected = scipy.stats.norm.logpdf(residuals[kept], scale=scale / weight[kept]).sum()
-    assert gaussian_log_likelihood(residuals, weight) == pytest.approx(expected, rel=1e-12)
+    found = log_likelihood(channel, residuals, (residuals * weight)[kept], 1.0)
+    assert found == pytest.approx(expected, rel=1e-12)
 
 
 def test_a_fits_criteria_count_what_was_freed(fit: fitact.Fit):
