@@ -7,30 +7,31 @@ unusual nuisance parameter or does not converge within a few steps is fitted sep
 import abc
 import dataclasses
 import functools
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
-import jax
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int
 
-from fitact.batch.gauss_newton import CANDIDATES, GaussNewton, RecordInputs
+from fitact.batch.gauss_newton import CANDIDATES, GaussNewton, GaussNewtonResult, RecordInputs
 from fitact.compiled import empty_aligned
 from fitact.data.clipping import clipping_mask
 from fitact.data.record import Record, white_noise_sds
 from fitact.fitting.derived import DerivedQuantities
-from fitact.fitting.least_squares import NUISANCES, bic_decrease
-from fitact.fitting.residual_tests import PhaseBins
+from fitact.fitting.least_squares import MIN_BIC_DECREASE, NUISANCES, bic_decrease
+from fitact.fitting.residual_statistics import is_misfit, residual_statistics
+from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics
 from fitact.likelihood.likelihood import Likelihood
+from fitact.likelihood.observable import LINEAR_NUISANCES
 from fitact.model.circuit import FINGER_PARAMETERS
-from fitact.model.response_table import ResponseTable
 from fitact.problem.starting_point import most_probable_skin, prior_skin_moments
 
 SAMPLE_BLOCK = 16  # records whose residuals are tested at once; see `map_blocks`
 
 _Rows = TypeVar("_Rows", np.ndarray, list[Any])
-_Tree = TypeVar("_Tree")
 
 
 class BatchFit(NamedTuple):
@@ -125,9 +126,9 @@ class BatchProblem(abc.ABC):
         records = [record for _, record in members]
         return records + records[-1:] * (self.unit - len(records))
 
-    def tabulate_responses(self, records: Sequence[Record], optima: BatchFit) -> ResponseTable | None:
-        """Return responses at the times of `derive` for each of `unit` records, or None if `derive` has the drive."""
-        return None
+    def derive_record(self, record: Record, inputs: RecordInputs, likelihood: Likelihood) -> DerivedQuantities:
+        """Return the derived quantities of a record, whose likelihood is that of `inputs`."""
+        return dataclasses.replace(self.derive, likelihood=likelihood)
 
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
@@ -157,6 +158,39 @@ class BatchProblem(abc.ABC):
         center = np.append(log_mean, np.zeros(len(self.names) - log_mean.size))
         return center, prior_skin_moments(self.likelihood)
 
+    def assess_optima(
+        self,
+        inputs: RecordInputs,
+        optima: GaussNewtonResult,
+        square: Float[np.ndarray, " records"],
+        tests: ResidualTestStatistics | None,
+        expected: Float[np.ndarray, " records"],
+        usable: Bool[np.ndarray, " records"],
+        log_derived: tuple[np.ndarray, np.ndarray],
+        interpolation_error: ArrayLike = 0.0,
+    ) -> BatchFit:
+        """Return the optima of records with their figures of merit, and whether each is accepted.
+
+        `square` are the residual sums of squares, `expected` is the sd of the noise as estimated without the model,
+        `usable` says which records have no other reason against them, and `log_derived` are the logarithms of the
+        derived quantities with their gradients. Compare `fitact.fitting.residual_statistics.channel_statistics`.
+        """
+        freedom = self.samples - len(self.names) - np.count_nonzero(inputs.linear_sd, axis=1)
+        figures = residual_statistics(square, self.samples, tests, expected, freedom, self.phases)
+        figures |= {"rounding_noise": np.zeros(len(square)), "interpolation_error": np.asarray(interpolation_error)}
+        accepted = usable & optima.converged & ~is_misfit(figures)
+        accepted &= np.max(self.bic_decreases(optima.r_squared), axis=1) <= MIN_BIC_DECREASE
+        others = [name for name in self.names if name not in FINGER_PARAMETERS]
+        freed = np.array(
+            [", ".join([*itertools.compress(LINEAR_NUISANCES, free), *others]) for free in inputs.linear_sd > 0.0]
+        )
+        factor = np.linalg.inv(optima.r_factor)
+        prior = np.array(np.broadcast_to(self.prior_factor, factor.shape))
+        if inputs.gain_sd is not None:
+            place = self.names.index("gain")
+            prior[:, place, place] = inputs.gain_sd
+        return BatchFit(accepted, inputs, optima.theta, optima.sigma, factor, prior, *log_derived, figures, freed)
+
     def bic_decreases(self, r_squared: Float[np.ndarray, "records candidates"]) -> np.ndarray:
         """Return the decrease of the BIC that each of `CANDIDATES` would cause; -inf for one that is not optional."""
         gains = np.full(r_squared.shape, -math.inf)
@@ -177,11 +211,6 @@ def stack_channel(records: Sequence[Record], channel: str) -> Float[np.ndarray, 
     stacked = empty_aligned((len(records), len(records[0])))
     np.concatenate([record[channel] for record in records], out=stacked.reshape(-1))  # faster than `np.stack`
     return stacked
-
-
-def take_rows(values: _Tree, rows: Int[np.ndarray, " some"]) -> _Tree:
-    """Return these rows of all arrays."""
-    return jax.tree.map(lambda each: each[rows], values)
 
 
 def split_rows(rows: _Rows, size: int) -> list[_Rows]:

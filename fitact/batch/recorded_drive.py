@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import itertools
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Self
@@ -29,12 +28,11 @@ from fitact.compiled import jit, map_blocks
 from fitact.data.record import Record, rounding_noise_sd
 from fitact.fitting.derived import DerivedQuantities
 from fitact.fitting.least_squares import MIN_BIC_DECREASE, NUISANCES
-from fitact.fitting.residual_statistics import interpolation_errors, is_misfit, residual_statistics
+from fitact.fitting.residual_statistics import interpolation_errors
 from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics, sum_rows
 from fitact.fitting.result import Fit
 from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import Likelihood
-from fitact.likelihood.observable import LINEAR_NUISANCES
 from fitact.likelihood.projection import MAX_DELAY, is_exactly_uniform
 from fitact.likelihood.smooth_drive import missing_curve
 from fitact.model.circuit import passes_direct_current
@@ -158,44 +156,17 @@ class RecordedDriveProblem(BatchProblem):
             self.shared, self.phases, self.evaluated.start, contact, whiteness, tables.b, optimum, V, Vsc, tables.smooth
         )
         expected = np.hypot(screened.noise, optimum.gain * noise_V)
-        figures = self._figures(V, driven.noise, expected, square, tests, inputs.linear_sd, optimum.gain)
-        factor = np.linalg.inv(optima.r_factor)
-        loss = np.abs(optima.sum_of_squares - square)
-        accepted = tables.is_possible & screened.fine & ~screened.railed & self._is_whole_drive(V, driven)
-        accepted &= optima.converged & (loss <= self.settings.max_rounding_loss * square) & ~is_misfit(figures)
-        accepted &= np.max(self.bic_decreases(optima.r_squared), axis=1) <= MIN_BIC_DECREASE
-        freed = np.array([self._nuisance_names(free) for free in inputs.linear_sd > 0.0])
-        prior = np.array(np.broadcast_to(self.prior_factor, factor.shape))
-        if gain_sd is not None:
-            place = self.names.index("gain")
-            prior[:, place, place] = gain_sd
-        theta, sigma = optima.theta, optima.sigma
-        return BatchFit(accepted, inputs, theta, sigma, factor, prior, logs, gradients, figures, freed)
+        usable = tables.is_possible & screened.fine & ~screened.railed & self._is_whole_drive(V, driven)
+        usable &= np.abs(optima.sum_of_squares - square) <= self.settings.max_rounding_loss * square
+        interpolation = optimum.gain * interpolation_errors(V, driven.noise)
+        return self.assess_optima(inputs, optima, square, tests, expected, usable, (logs, gradients), interpolation)
 
-    def tabulate_responses(self, records: Sequence[Record], optima: BatchFit) -> ResponseTable:
-        """Return responses at the times of `derive` for each of `unit` records."""
-        V, size = stack_channel(records, "V"), self.derive.time.size
+    def derive_record(self, record: Record, inputs: RecordInputs, likelihood: Likelihood) -> DerivedQuantities:
+        """Return the derived quantities of a record, with its own drive."""
+        V, size = record["V"][None], self.derive.time.size
         noise = _drive_noise(V, Screening.from_values(V, self.settings))
-        return _tabulate_responses(self.shared, self.evaluated.start, size, optima.inputs.table["center"], V, noise)
-
-    def _figures(
-        self,
-        V: Float[np.ndarray, "records samples"],
-        white_V: Float[np.ndarray, " records"],
-        expected: Float[np.ndarray, " records"],
-        square: Float[np.ndarray, " records"],
-        tests: ResidualTestStatistics | None,
-        linear_sd: Float[np.ndarray, "records nuisances"],
-        gain: Float[np.ndarray, " records"],
-    ) -> dict[str, np.ndarray]:
-        """Return the figures of merit, for white noise of V and the `expected` noise of the residuals.
-
-        Compare `fitact.fitting.residual_statistics.channel_statistics`.
-        """
-        freedom = self.samples - len(self.names) - np.count_nonzero(linear_sd, axis=1)
-        figures = residual_statistics(square, self.samples, tests, expected, freedom, self.phases)
-        interpolation = gain * interpolation_errors(V, white_V)
-        return figures | {"rounding_noise": np.zeros(len(V)), "interpolation_error": interpolation}
+        table = _tabulate_responses(self.shared, self.evaluated.start, size, inputs.table["center"], V[0], noise[0])
+        return dataclasses.replace(self.derive, likelihood=likelihood, drive=table)
 
     def _is_whole_drive(
         self, V: Float[np.ndarray, "records samples"], driven: Screening
@@ -235,11 +206,6 @@ class RecordedDriveProblem(BatchProblem):
                 return inputs, optima
             start, noise = optima.theta, optima.sigma  # near the next optimum
             tolerance = self.settings.loop_tolerance
-
-    def _nuisance_names(self, is_free: Bool[np.ndarray, " nuisances"]) -> str:
-        """Return the names of the nuisances that were fitted, as in `Fit.model`."""
-        names = itertools.compress(LINEAR_NUISANCES, is_free)
-        return ", ".join([*names, *(name for name in self.names if name in ("gain", "delay"))])
 
 
 def _drive_noise(V: Float[np.ndarray, "records samples"], driven: Screening) -> Float[np.ndarray, " records"]:
@@ -360,25 +326,14 @@ def _derive_record(
 
 @functools.partial(jit, fast=True)
 def _tabulate_responses(
-    shared: SharedFunctions,
-    begin: int,
-    count: int,
-    center: Float[Array, " records"],
-    V: Float[Array, "records samples"],
-    noise: Float[Array, " records"],
+    shared: SharedFunctions, begin: int, count: int, center: Array, V: Float[Array, " samples"], noise: Array
 ) -> ResponseTable:
-    """Return a table for each record, padded to `count` times; `noise` is the sd of that of V."""
-    series = chebyshev(TABLE_NODES)[1].T
-
-    def tabulate_record(record: tuple[Array, Array, Array]) -> ResponseTable:
-        center, v, sd = record
-        nodes = table_nodes(jnp.exp(center))
-        own = shared.respond(shared.smooth_drive(v, sd), nodes)
-        decays = (shared.decay @ shared.decay_polynomials(nodes)).T @ shared.functions
-        signal, decay = (
-            jnp.pad(series.T @ each[:, begin : begin + count], ((0, 0), (0, max(begin + count - v.size, 0)))).T
-            for each in (own, decays)
-        )
-        return make_response_table(center, signal, decay)
-
-    return map_blocks(tabulate_record, (center, V, noise), RECORD_BLOCK)
+    """Return the table of a record, padded to `count` times; `noise` is the sd of that of V."""
+    series, nodes = chebyshev(TABLE_NODES)[1].T, table_nodes(jnp.exp(center))
+    own = shared.respond(shared.smooth_drive(V, noise), nodes)
+    decays = (shared.decay @ shared.decay_polynomials(nodes)).T @ shared.functions
+    signal, decay = (
+        jnp.pad(series.T @ each[:, begin : begin + count], ((0, 0), (0, max(begin + count - V.size, 0)))).T
+        for each in (own, decays)
+    )
+    return make_response_table(center, signal, decay)

@@ -18,8 +18,6 @@ from fitact.compiled import jit, map_blocks
 from fitact.data.record import Record
 from fitact.fitting import derived
 from fitact.fitting.derived import DerivedQuantities, log_derivatives
-from fitact.fitting.least_squares import MIN_BIC_DECREASE
-from fitact.fitting.residual_statistics import is_misfit, residual_statistics
 from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics, sum_rows
 from fitact.likelihood.observable import LINEAR_NUISANCES
 from fitact.model.chirp import Chirp
@@ -92,8 +90,8 @@ class StatedDriveProblem(BatchProblem):
         noise, height, fine, railed = map(np.concatenate, zip(*screened, strict=True))
         coordinates = self.basis.project(observed)
         inputs = self.make_inputs(coordinates, MIN_RELATIVE_NOISE * height)
-        optima, accepted = self.find_optima(inputs, noise)
-        logs, gradients = _log_derived(self.derive, optima.theta)
+        optima, in_table = self.find_optima(inputs, noise)
+        log_derived = _log_derived(self.derive, optima.theta)
         square, tests = optima.sum_of_squares, None
         if whiteness:
             fitted, functions = optima.fitted[:, : len(self.basis.compression.signal)], self.basis.functions
@@ -102,16 +100,8 @@ class StatedDriveProblem(BatchProblem):
         else:
             # relative to the square of the record; 12 eps was observed
             loss = 32.0 * np.finfo(float).eps * np.vecdot(coordinates, coordinates)
-        freedom = self.samples - optima.theta.shape[1]
-        figures = residual_statistics(square, self.samples, tests, noise, freedom, self.phases)
-        figures |= {"rounding_noise": np.zeros(len(noise)), "interpolation_error": np.zeros(len(noise))}
-        needs_nuisance = np.max(self.bic_decreases(optima.r_squared), axis=1) > MIN_BIC_DECREASE
-        accepted &= optima.converged & fine & ~railed & ~needs_nuisance & ~is_misfit(figures)
-        accepted &= loss <= self.settings.max_rounding_loss * square
-        factor, freed = np.linalg.inv(optima.r_factor), np.full(len(noise), "")
-        prior = np.broadcast_to(self.prior_factor, factor.shape)
-        theta, sigma = optima.theta, optima.sigma
-        return BatchFit(accepted, inputs, theta, sigma, factor, prior, logs, gradients, figures, freed)
+        usable = in_table & fine & ~railed & (loss <= self.settings.max_rounding_loss * square)
+        return self.assess_optima(inputs, optima, square, tests, noise, usable, log_derived)
 
     @staticmethod
     def make_inputs(

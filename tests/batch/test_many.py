@@ -95,6 +95,14 @@ def test_each_row_is_the_fit_of_its_record(fits, given, number):
     assert row["chi2_reduced"] == pytest.approx(alone.figures["chi2_reduced"], rel=1e-9)
 
 
+def test_a_free_gain_is_named_in_batches_too():
+    scene = SCENE.model_copy(update={"measurement": SCENE.measurement.model_copy(update={"gain_relative_sd": 0.02})})
+    given = [record(number) for number in range(16)]
+    rows, alone = fitact.fit_many(given, scene, progress=False), fitact.fit(given[0], scene)
+    assert {row["freed"] for row in rows} == {", ".join(alone.model()["freed"])} == {"gain"}
+    assert rows[0]["Ci"] == pytest.approx(np.exp(alone.theta[2]), rel=1e-6)
+
+
 def with_line(clean: fitact.Record, amplitude: float) -> fitact.Record:
     """Return the record with an added sine; `amplitude` is in units of the noise sd."""
     line = 0.1 * amplitude * np.sin(2.0 * np.pi * 730.0 * clean.time)

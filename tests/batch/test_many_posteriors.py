@@ -190,7 +190,7 @@ def test_rows_do_not_depend_on_what_else_is_sampled(found, given):
 
 
 def test_what_has_not_converged_together_is_sampled_alone(given, monkeypatch):
-    monkeypatch.setattr(module, "_sample_block", functools.partial(module._sample_block, min_effective=1e9))
+    monkeypatch.setattr(module, "_sample_record", functools.partial(module._sample_record, min_effective=1e9))
     monkeypatch.setattr(module, "_alone", lambda record, scene, seed: {"record": record.source})
     rows = sample_many([each for each in given if isinstance(each, fitact.Record)], SCENE, progress=False)
     assert all(row.keys() == {"record"} for row in rows)

@@ -76,7 +76,7 @@ def test_a_component_is_the_change_for_a_shifted_prior(fit: fitact.Fit, record: 
     monkeypatch.setattr(module, "build_problem", shifted)
     again = fitact.fit(record, session.scene("Vsc"))
     place = fit.names.index(name)
-    sources = {source.name for source in fit.error_sources[place]}
+    sources = {each.source for each in fit.error_sources[place]}
     for quantity in ("g", "b", "force_mean"):
         rows = [each for each in fit.budgets[quantity].components if each.source in sources]
         component = math.hypot(*(each.u for each in rows))
