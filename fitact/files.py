@@ -4,11 +4,17 @@ import contextlib
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from fitact.errors import InputError
+
+# commands that make the contents of folders
+_REMEDIES = {
+    "results": "make them with: fitact sample RECORD",
+    "population": "make it with: fitact population RECORD...",
+}
 
 
 @contextlib.contextmanager
@@ -71,6 +77,19 @@ def write_parquet(path: str | os.PathLike[str], columns: Mapping[str, Any]) -> N
         pq.write_table(pa.table(columns), temporary)
 
 
+@contextlib.contextmanager
+def complete_folder(path: str | os.PathLike[str], content: str) -> Iterator[Path]:
+    """Yield a folder from which the block reads its `content`, "results" or "population".
+
+    Raises:
+        InputError: the block raised an error of reading.
+    """
+    try:
+        yield Path(path)
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise InputError(f"{path}: holds no complete {content} ({error}); {_REMEDIES[content]} --out {path}") from error
+
+
 def read_datatree(path: str | os.PathLike[str]) -> Any:
     """Return the `xarray.DataTree` of a NetCDF file; raise what xarray does."""
     import xarray as xr  # slow to import, and few commands read NetCDF
@@ -96,17 +115,20 @@ def read_head(path: str | os.PathLike[str], size: int = 4096) -> bytes:
 
 def to_json(content: Any, indent: int | None = 2) -> str:
     """Return standard JSON, with null for values that are not finite; without `indent`, on one line."""
-    return json.dumps(_to_plain(content), indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
+    return json.dumps(map_leaves(_to_null, content), indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def _to_plain(content: Any) -> Any:
+def map_leaves(function: Callable[[Any], Any], content: Any) -> Any:
+    """Return dicts, with names as keys, and lists as JSON has them, with `function` of what they hold."""
     if isinstance(content, dict):
-        return {str(key): _to_plain(value) for key, value in content.items()}
+        return {str(key): map_leaves(function, value) for key, value in content.items()}
     if isinstance(content, list | tuple):
-        return [_to_plain(value) for value in content]
-    if isinstance(content, float) and not math.isfinite(content):
-        return None
-    return content
+        return [map_leaves(function, value) for value in content]
+    return function(content)
+
+
+def _to_null(leaf: Any) -> Any:
+    return None if isinstance(leaf, float) and not math.isfinite(leaf) else leaf
 
 
 def write_json(path: str | os.PathLike[str], content: Any) -> None:

@@ -8,13 +8,12 @@ import platform
 import re
 import statistics
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from fitact.errors import InputError
+from fitact.files import complete_folder
 from fitact.units import (
     DERIVED,
     GEOMETRY,
@@ -158,15 +157,11 @@ def round_to_sd(values: Iterable[float], sd: float) -> list[str]:
 
 def load(directory: str | os.PathLike[str]) -> dict[str, Any]:
     """Read summary.json from a folder that `fitact sample` or `fitact run` wrote."""
-    try:
-        content = json.loads((Path(directory) / "summary.json").read_text(encoding="utf-8"))
+    with complete_folder(directory, "results") as folder:
+        content = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         if not (isinstance(content, dict) and set(content) >= _SECTIONS):
             raise ValueError("summary.json is not fitact's")
-        return content
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{directory}: holds no complete results ({error}); make them with: fitact sample RECORD --out {directory}"
-        ) from error
+    return content
 
 
 def versions() -> dict[str, str]:

@@ -2,13 +2,11 @@
 
 import json
 import os
-from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from fitact.errors import InputError
-from fitact.files import read_datatree
+from fitact.files import complete_folder, read_datatree
 from fitact.populations.finger import SHARED_PARAMETER, SKIN
 from fitact.populations.population import Population, draw_parameters
 from fitact.populations.population_parameters import COMPONENTS, PopulationParameters, level_endings
@@ -40,18 +38,13 @@ class PopulationDraws(NamedTuple):
         Raises:
             InputError: the folder holds no complete population.
         """
-        try:
-            content = json.loads((Path(path) / "population.json").read_text(encoding="utf-8"))
-            posterior = read_datatree(Path(path) / "population.nc")["posterior"].to_dataset()
+        with complete_folder(path, "population") as folder:
+            content = json.loads((folder / "population.json").read_text(encoding="utf-8"))
+            posterior = read_datatree(folder / "population.nc")["posterior"].to_dataset()
             names = tuple(level["level"] for level in content["levels"])
             law = _read_parameters(posterior, names, content["population"]["covariates"], count)
             trusted = content["trusted"] and _are_mostly_good([each["result"] for each in content["fingers"]])
             return cls(law, names, describe_units(content["levels"]), trusted, tuple(content["warnings"]))
-        except (OSError, ValueError, TypeError, KeyError) as error:
-            raise InputError(
-                f"{path}: holds no complete population ({error}); make it with: fitact population RECORD... --out"
-                f" {path}"
-            ) from error
 
 
 def _are_mostly_good(results: list[str]) -> bool:

@@ -3,7 +3,6 @@
 import json
 import os
 import shlex
-from pathlib import Path
 from typing import Any
 
 import jinja2
@@ -12,7 +11,7 @@ from markupsafe import Markup
 
 from fitact.charts.bars import draw_budgets
 from fitact.errors import InputError
-from fitact.files import read_datatree
+from fitact.files import complete_folder, read_datatree
 from fitact.report.frame import image, write_page
 from fitact.report.posterior import make_charts
 from fitact.result_text import (
@@ -84,12 +83,8 @@ def write_report(path: str | os.PathLike[str], tree: Any, summary: dict[str, Any
 def read_results(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]]:
     """Read what `write_report` needs from a folder of results; raise InputError if it is incomplete."""
     content = load(directory)
-    try:
-        return read_datatree(Path(directory) / "posterior.nc"), content
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(
-            f"{directory}: holds no complete results ({error}); make them with: fitact sample RECORD --out {directory}"
-        ) from error
+    with complete_folder(directory, "results") as folder:
+        return read_datatree(folder / "posterior.nc"), content
 
 
 def _panels(traces: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:

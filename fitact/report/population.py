@@ -6,7 +6,6 @@ import math
 import os
 import shlex
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 from fitact.charts.figure import write_figure
@@ -19,8 +18,7 @@ from fitact.charts.population import (
     is_drawable,
     skin_chart,
 )
-from fitact.errors import InputError
-from fitact.files import read_datatree
+from fitact.files import complete_folder, map_leaves, read_datatree
 from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.populations.exact_likelihood import MAX_INTEGRATION_ERROR
 from fitact.populations.population_text import (
@@ -74,7 +72,7 @@ def write_population(path: str | os.PathLike[str], tree: Any, content: dict[str,
 
 def write_population_page(path: str | os.PathLike[str], tree: Any, content: dict[str, Any]) -> None:
     """Write the page from the content of population.nc and population.json."""
-    content = content | {name: _null_to_nan(content[name]) for name in (*_NUMERIC, "integrals_off")}
+    content = content | {name: map_leaves(_null_to_nan, content[name]) for name in (*_NUMERIC, "integrals_off")}
     next_touch = describe_next_touch(content["levels"])
     write_page(
         path,
@@ -98,26 +96,16 @@ def write_population_page(path: str | os.PathLike[str], tree: Any, content: dict
 
 def read_population(directory: str | os.PathLike[str]) -> tuple[Any, dict[str, Any]]:
     """Read what `write_population_page` needs from a folder of results; raise InputError if it is incomplete."""
-    try:
-        content = json.loads((Path(directory) / "population.json").read_text(encoding="utf-8"))
+    with complete_folder(directory, "population") as folder:
+        content = json.loads((folder / "population.json").read_text(encoding="utf-8"))
         if not (isinstance(content, dict) and {"trusted", "levels"} <= set(content)):
             raise ValueError("population.json is not this version's")
-        return read_datatree(Path(directory) / "population.nc"), content
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise InputError(
-            f"{directory}: holds no complete population ({error}); make it with: fitact population RECORD..."
-            f" --out {directory}"
-        ) from error
+        return read_datatree(folder / "population.nc"), content
 
 
-def _null_to_nan(content: Any) -> Any:
+def _null_to_nan(leaf: Any) -> Any:
     """Replace null, which JSON has for non-finite numbers, by NaN."""
-    if isinstance(content, dict):
-        return {name: _null_to_nan(value) for name, value in content.items()}
-    if isinstance(content, list | tuple):
-        return [_null_to_nan(value) for value in content]
-    infinite = isinstance(content, float) and not math.isfinite(content)
-    return math.nan if content is None or infinite else content
+    return math.nan if leaf is None or (isinstance(leaf, float) and not math.isfinite(leaf)) else leaf
 
 
 def _figures(tree: Any, content: dict[str, Any]) -> dict[str, Any]:
