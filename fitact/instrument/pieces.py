@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Iterable
-from typing import Any, Self
+from typing import Self
 
 from fitact.instrument.classes import CLASSES
 from fitact.model.circuit import Probe
@@ -44,15 +44,11 @@ class Piece:
     @functools.cache
     def from_class(cls, name: str) -> Self:
         """Return a piece with the errors of its class."""
-        kind = CLASSES[name.partition(":")[0]]
-        stated: dict[str, Any] = {key: getattr(kind, key) or 0.0 for key in ("offset", "skew", "skew_intervals")}
-        for key in ("gain", "compensation", "nonlinearity"):
-            if limit := getattr(kind, key):
-                stated[key] = Uniform.with_tolerance(1.0, limit)
-        for key in ("resistance", "capacitance"):
-            if limits := getattr(kind, key):
-                stated[key] = Uniform.with_tolerance(*limits)
-        return cls(name, **stated, source=kind.source, is_probe=name.startswith("probe-"))
+        stated = dict(CLASSES[name.partition(":")[0]])
+        for key in stated.keys() & {"gain", "compensation", "nonlinearity", "resistance", "capacitance"}:
+            limits = stated[key]
+            stated[key] = Uniform.with_tolerance(*(limits if isinstance(limits, tuple) else (1.0, limits)))
+        return cls(name, **stated, is_probe=name.startswith("probe-"))
 
     def nominal_probe(self) -> Probe:
         """Return the load at its median values."""
