@@ -19,26 +19,16 @@ NO_SAFETY_ASSESSMENT = (
 )
 
 
-class PublishedLimit(NamedTuple):
-    """A limit of a quantity of `PeriodQuantities`, from a standard."""
-
-    source: str
-    name: str  # its meaning there
-    quantity: str
-    limit: float  # A
-    lowest: float  # Hz; the standard gives the limit from here
-    highest: float  # to here
-
-
 AC_1, AC_3 = "IEC 60479-1, zone AC-1", "IEC 60479-1, zone AC-3"
 ES1 = "IEC 62368-1, class ES1"
 PATIENT_LEAKAGE = "IEC 60601-1, patient leakage current"
+# standard, meaning of the limit there, quantity of `PeriodQuantities`, limit (A), and range of frequencies (Hz)
 PUBLISHED_LIMITS = (
-    PublishedLimit(AC_1, "upper end: perception possible, usually no startle", "current_rms", 0.5e-3, 15.0, 100.0),
-    PublishedLimit(AC_3, "lower end, long contact: muscles contract involuntarily", "current_rms", 5e-3, 15.0, 100.0),
-    PublishedLimit(ES1, "touchable by ordinary persons", "current_rms", 0.5e-3, 0.0, 1e3),
-    PublishedLimit(ES1, "touchable by ordinary persons", "current_peak", 0.707e-3, 0.0, 1e3),
-    PublishedLimit(PATIENT_LEAKAGE, "medical equipment, type BF, normal condition", "current_rms", 0.1e-3, 0.0, 1e3),
+    (AC_1, "upper end: perception possible, usually no startle", "current_rms", 0.5e-3, 15.0, 100.0),
+    (AC_3, "lower end, long contact: muscles contract involuntarily", "current_rms", 5e-3, 15.0, 100.0),
+    (ES1, "touchable by ordinary persons", "current_rms", 0.5e-3, 0.0, 1e3),
+    (ES1, "touchable by ordinary persons", "current_peak", 0.707e-3, 0.0, 1e3),
+    (PATIENT_LEAKAGE, "medical equipment, type BF, normal condition", "current_rms", 0.1e-3, 0.0, 1e3),
 )
 _NAMES = {"current_rms": "rms current", "current_peak": "peak current"}
 
@@ -88,25 +78,19 @@ class LimitComparison(NamedTuple):
 
 def compare_with_limits(frequency: float, at_amplitude: PeriodQuantities, device: Device) -> list[LimitComparison]:
     """Compare the body current and the insulator's field at an amplitude with published limits and the scene's."""
+
+    def value(quantity: str) -> float:
+        return float(getattr(at_amplitude, quantity))
+
     rows = [
-        LimitComparison(
-            each.source,
-            each.name,
-            _NAMES[each.quantity],
-            float(getattr(at_amplitude, each.quantity)),
-            each.limit,
-            "A",
-            (each.lowest, each.highest),
-            each.lowest <= frequency <= each.highest,
-        )
-        for each in PUBLISHED_LIMITS
+        LimitComparison(source, name, _NAMES[key], value(key), limit, "A", (low, high), low <= frequency <= high)
+        for source, name, key, limit, low, high in PUBLISHED_LIMITS
     ]
     stated = {"current_rms": device.current_limit_rms, "current_peak": device.current_limit_peak}
     for name, limit in stated.items():
         if limit is not None:
             key = f"[device] {name.replace('_', '_limit_')}"
-            value = float(getattr(at_amplitude, name))
-            rows.append(LimitComparison(key, "your limit", _NAMES[name], value, limit, "A"))
+            rows.append(LimitComparison(key, "your limit", _NAMES[name], value(name), limit, "A"))
     field = float(at_amplitude.insulator_peak) / device.insulator_thickness
     source = "data sheet of the insulator" if device.breakdown_field is None else "[device] breakdown_field"
     name = "breakdown field of the material at this thickness"
