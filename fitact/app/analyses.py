@@ -1,5 +1,6 @@
 """Analyses as folders: the files, their columns, the scene, and the command that makes the results."""
 
+import itertools
 import json
 import os
 import re
@@ -99,7 +100,8 @@ class Analysis:
         """
         own = re.sub(r"[^A-Za-z0-9._-]+", "_", re.split(r"[/\\]", name)[-1])[-max_length:].lstrip("._-") or "file"
         taken = {each.casefold() for each in self.files}
-        own = next(each for each in _name_candidates(own) if each.casefold() not in taken)
+        names = itertools.chain([own], (f"{number}_{own}" for number in itertools.count(2)))
+        own = next(each for each in names if each.casefold() not in taken)
         os.replace(temporary, self.folder / "records" / own)
         self.files[own] = "".join(character if character.isprintable() else "�" for character in name)[:200]
         self.save()
@@ -153,15 +155,8 @@ class Analysis:
         if process is not None and process.stdin is not None:
             process.stdin.close()
 
-    def read_messages(self) -> list[str]:
-        """Return the lines that the command wrote to standard error."""
-        return self._read("messages.txt").splitlines()
-
-    def read_output(self) -> str:
-        """Return what the command wrote to standard output."""
-        return self._read("output.txt")
-
-    def _read(self, name: str) -> str:
+    def read(self, name: str) -> str:
+        """Return what the command wrote: messages.txt is its standard error, output.txt its standard output."""
         path = self.folder / name
         return path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
 
@@ -176,14 +171,6 @@ class Analysis:
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
             for each in (*self.result_files(), *(self.folder / "records" / own for own in self.files)):
                 archive.write(each, Path(self.name) / each.relative_to(self.folder))
-
-
-def _name_candidates(name: str) -> Iterator[str]:
-    yield name
-    number = 2
-    while True:
-        yield f"{number}_{name}"
-        number += 1
 
 
 def _link(source: str, target: str) -> None:

@@ -230,7 +230,7 @@ class Page:
     async def show_progress(self, request: Request) -> Response:
         """Return the state and the messages of the command."""
         analysis = self._find(request)
-        state, messages = analysis.state, analysis.read_messages()
+        state, messages = analysis.state, analysis.read("messages.txt").splitlines()
         percent = _PERCENT.search(messages[-1]) if messages else None
         return JSONResponse({"state": state, "messages": messages, "percent": percent and int(percent[1])})
 
