@@ -40,12 +40,13 @@ _LCR_NAMES = {
     name: re.compile(rf"^({pattern})(?![a-z])", re.IGNORECASE)
     for name, pattern in {
         "Cp": "c_?p", "Cs": "c_?s", "Lp": "l_?p", "Ls": "l_?s", "Rp": "r_?p", "Rs": "r_?s|esr",
-        "G": "g_?p?|conductance", "B": "b_?p?|susceptance", "Y": r"\|y\||y|admittance",
+        "G": "g_?p?|conductance", "B": "b_?p?|susceptance", "|Y|": r"\|y\||y|admittance",
         "D": "d|df|tan ?(δ|delta)|dissipation( factor)?", "Q": "q|quality( factor)?",
     }.items()
 }  # fmt: skip
 _LCR_UNIT = re.compile(r"[(/_\[\s]([fpnuµμmkMG]?)(?:[FHS]|Ω|Ω|(?i:ohms?|farad|henry|siemens))\b")
-_Pair = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # omega (rad/s) and the two values to impedance, ohm
+# omega (rad/s) and the two values, of which an angle is in radians times the imaginary unit, to impedance, ohm
+_Pair = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 _LCR_PAIRS: dict[tuple[str, str], _Pair] = {
     ("Cp", "D"): lambda w, C, D: 1.0 / (w * C * (D + 1j)),
     ("Cp", "Q"): lambda w, C, Q: 1.0 / (w * C * (1.0 / Q + 1j)),
@@ -62,6 +63,7 @@ _LCR_PAIRS: dict[tuple[str, str], _Pair] = {
     ("Ls", "Q"): lambda w, L, Q: w * L * (1.0 / Q + 1j),
     ("Ls", "Rs"): lambda w, L, R: R + 1j * w * L,
     ("G", "B"): lambda w, G, B: 1.0 / (G + 1j * B),
+    ("|Y|", "theta"): lambda w, Y, turn: np.exp(-turn) / Y,
 }
 _LATE_TABLES = re.compile(r"^(EXPLAIN|EC-Lab|<Application>|\"?ZPLOT|\"?Z60W|\0)")  # first lines of long headers
 
@@ -279,30 +281,23 @@ def _pair_layout(names: Sequence[str], frequency: int) -> _Layout | None:
     """Return the layout of a pair of an LCR meter, such as Cp and D or |Y| and theta, or None."""
     found = {name: place for name, pattern in _LCR_NAMES.items() if (place := _find_name(pattern, names)) is not None}
     hertz = _to_hertz(names[frequency])
+    if (phase := _find_name(_PHASE, names)) is not None:
+        found["theta"] = phase
 
-    def factor(name: str) -> float:
-        prefix = _LCR_UNIT.search(names[found[name]])
-        return PREFIX_FACTORS[prefix[1]] if prefix else 1.0
+    def factor(name: str) -> complex:
+        column = names[found[name]]
+        return _find_turn(column) if name == "theta" else _find_factor(_LCR_UNIT, column)
 
     for (first, second), impedance in _LCR_PAIRS.items():
         if first in found and second in found:
             factors = factor(first), factor(second)
 
-            def convert(x: Rows, impedance: _Pair = impedance, factors: tuple[float, float] = factors) -> Any:
+            def convert(x: Rows, impedance: _Pair = impedance, factors: tuple[complex, complex] = factors) -> Any:
                 f = hertz(x[:, 0])
                 return f, impedance(2.0 * np.pi * f, factors[0] * x[:, 1], factors[1] * x[:, 2])
 
             places = frequency, found[first], found[second]
             return _Layout("impedance", places, convert, note=f"the impedance follows from {first} and {second}")
-    phase = _find_name(_PHASE, names)
-    if "Y" in found and phase is not None:
-        scale, turn = factor("Y"), _find_turn(names[phase])
-        return _Layout(
-            "impedance",
-            (frequency, found["Y"], phase),
-            lambda x: (hertz(x[:, 0]), np.exp(-turn * x[:, 2]) / (scale * x[:, 1])),
-            note="the impedance follows from |Y| and theta",
-        )
     return None
 
 
