@@ -1,28 +1,13 @@
-"""Circuit and wiring diagrams of a scene, with the values of its elements."""
+"""Values of the elements in the circuit diagram of a scene."""
 
 from collections.abc import Mapping
 
-from markupsafe import Markup
-
-from fitact.charts.circuit_diagram import Grounding, Lead, lay_out_circuit, lay_out_wiring
 from fitact.model.force import FRICTION_PARAMETERS
 from fitact.scene.sections import Measurement
 from fitact.summary import Summary, format_estimate
 from fitact.units import format_engineering, quantity_unit
 
 _NOT_PARTS = {"sigma", "sigma_I", "sigma_Ft", *FRICTION_PARAMETERS}
-
-
-def draw_circuit(parts: Mapping[str, str], grounding: Grounding, lead: Lead | None, *, is_file: bool) -> Markup:
-    """Draw a circuit, whose `parts` have these values, as an SVG element, or as a file."""
-    svg = lay_out_circuit(parts, grounding, lead).svg(f"The circuit with {grounding} ground", is_file=is_file)
-    return Markup(svg)
-
-
-def draw_wiring(measured: Measurement, grounding: Grounding, lead: Lead | None, *, is_file: bool) -> Markup:
-    """Draw how a record is measured, as an SVG element, or as a file."""
-    diagram = lay_out_wiring(grounding, measured.channels, measured.series_resistor > 0.0, lead)
-    return Markup(diagram.svg(f"The wiring with {grounding} ground", is_file=is_file))
 
 
 def describe_parts(

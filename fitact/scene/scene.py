@@ -18,7 +18,7 @@ from jax.typing import ArrayLike
 from markupsafe import Markup
 from pydantic import model_validator
 
-from fitact.charts.circuit_diagram import Lead
+from fitact.charts.circuit_diagram import Lead, lay_out_circuit, lay_out_wiring
 from fitact.errors import InputError
 from fitact.instrument.pieces import Piece, find_load
 from fitact.model.circuit import RC, Circuit, DirectGround, FinalCircuit, NaturalGround, Probe
@@ -136,13 +136,16 @@ class Scene(Section, Display):
 
     def draw_circuit(self, values: Mapping[str, Summary] | None = None, *, is_file: bool = False) -> Markup:
         """Draw the circuit as an SVG element, or as a file; `values`, by name, replace the scene's."""
-        parts, lead = self.describe_parts(values or {}), self.find_current_lead()
-        return diagrams.draw_circuit(parts, self.grounding.connection, lead, is_file=is_file)
+        grounding = self.grounding.connection
+        diagram = lay_out_circuit(self.describe_parts(values or {}), grounding, self.find_current_lead())
+        return Markup(diagram.svg(f"The circuit with {grounding} ground", is_file=is_file))
 
     def draw_wiring(self, *, is_file: bool = False) -> Markup:
         """Draw how the record is measured, as an SVG element, or as a file."""
-        lead = self.find_current_lead()
-        return diagrams.draw_wiring(self.measurement, self.grounding.connection, lead, is_file=is_file)
+        grounding, measured = self.grounding.connection, self.measurement
+        has_shunt = measured.series_resistor > 0.0
+        diagram = lay_out_wiring(grounding, measured.channels, has_shunt, self.find_current_lead())
+        return Markup(diagram.svg(f"The wiring with {grounding} ground", is_file=is_file))
 
     def describe_parts(self, values: Mapping[str, Summary]) -> dict[str, str]:
         """Return each part's value with its unit, by name, of `values` with their standard deviation.
