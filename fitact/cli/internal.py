@@ -17,7 +17,6 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "paper": ["reproduce"],
         "populations.covariates": ["read_covariates"],
         "populations.fit_population": ["delete_chains"],
-        "populations.population_draws": ["PopulationDraws"],
         "populations.record_files": ["RecordFiles"],
         "readers.read": ["read_any", "write_csv"],
         "readers.spectrum": ["is_spectrum"],
