@@ -4,9 +4,9 @@ python benchmarks/instruments.py [--rounds 9] [--json]
 """
 
 import argparse
-import json
-import statistics
-import time
+import functools
+
+from timing import medians, show
 
 import fitact
 from fitact.data.simulate import simulate
@@ -30,23 +30,16 @@ def main() -> None:
         record = simulate(source, seed=1)
         plain = fitact.Scene.from_dict({"drive": {"waveform": "measured"}})
         stated = fitact.Scene.from_dict({"drive": {"waveform": "measured"}, "instrument": EQUIPMENT})
-        seconds: dict[str, list[float]] = {"plain": [], "stated": [], "stated and written": []}
-        for _ in range(arguments.rounds + 1):
-            for name, scene in (("plain", plain), ("stated", stated)):
-                start = time.perf_counter()
-                fit = fitact.fit(record, scene)
-                seconds[name].append(time.perf_counter() - start)
-            start = time.perf_counter()
-            fit.to_dict()
-            seconds["stated and written"].append(seconds["stated"][-1] + time.perf_counter() - start)
-        base, *others = (statistics.median(times[1:]) for times in seconds.values())  # the first round compiles
-        for name, each in zip(list(seconds)[1:], others, strict=True):
+        jobs = {
+            "plain": functools.partial(fitact.fit, record, plain),
+            "stated": functools.partial(fitact.fit, record, stated),
+            "stated and written": lambda record=record, stated=stated: fitact.fit(record, stated).to_dict(),
+        }
+        seconds = medians(jobs, arguments.rounds)
+        base = seconds.pop("plain")
+        for name, each in seconds.items():
             ratios[f"{name}, {samples} samples, over a fit without instruments"] = each / base
-    if arguments.json:
-        print(json.dumps(ratios))
-    else:
-        for name, ratio in ratios.items():
-            print(f"{ratio:.2f}  {name}")
+    show(ratios, arguments.json)
 
 
 if __name__ == "__main__":
