@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-import scipy.linalg
+import scipy.signal
 
 from data_synth.errors import RecipeError
 from data_synth.network import EPS0
@@ -34,17 +34,10 @@ def friction(scene: Scene, waves: Waves, time: np.ndarray, part: Mapping[str, An
     force = _force(scene, *waves(fine)[:2])
     # the middle of each part of a step, so that a jump at a grid point belongs to one side
     middle = 0.5 * (force[1:] + force[:-1])
-    A = np.array([[-w]]) if z is None else np.array([[0.0, 1.0], [-(w**2), -2.0 * z * w]])
-    B = np.array([w]) if z is None else np.array([0.0, w**2])
-    size = len(A)
-    whole = np.zeros((size + 1, size + 1))
-    whole[:size, :size], whole[:size, size] = A * step / _FINE, B * step / _FINE
-    moved = scipy.linalg.expm(whole)
-    state, read = np.append(np.full(1, force[0]), np.zeros(size - 1)), np.empty(fine.size)
-    read[0] = state[0]
-    for n, f in enumerate(middle):
-        state = moved[:size, :size] @ state + moved[:size, size] * f
-        read[n + 1] = state[0]
+    polynomial = [1.0, w] if z is None else [1.0, 2.0 * z * w, w**2]
+    (numerator,), denominator, _ = scipy.signal.cont2discrete((polynomial[-1:], polynomial), step / _FINE, "zoh")
+    # settled at the first force, it stays there without further change
+    read = force[0] + scipy.signal.lfilter(numerator, denominator, np.append(middle, middle[-1]) - force[0])
     return constant + factor * read[lead * _FINE :: _FINE] + crosstalk
 
 
