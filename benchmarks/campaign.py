@@ -116,7 +116,7 @@ def campaign_scene(kind: str) -> fitact.Scene | None:
 
 def workers(count: int) -> contextlib.AbstractContextManager[Any]:
     """Yield a client of workers started as by the command."""
-    return campaign._open_client(None, count, "2 GiB", campaign._Progress(0, False), 0.0)
+    return campaign._open_client(None, count, "2 GiB", False, 0.0)
 
 
 class Cost(NamedTuple):

@@ -5,7 +5,6 @@ import functools
 import math
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
@@ -13,9 +12,10 @@ from jaxtyping import Array, Bool, Float
 from fitact.compiled import as_arrays, jit, pad_samples
 from fitact.data.record import Record, resample_uniform
 from fitact.errors import InputError
+from fitact.likelihood.projection import evaluate_voltage
 from fitact.model.chirp import Chirp
 from fitact.model.drive import Burst, Drive, Periodic, Sampled, Sine, Square
-from fitact.model.response import highpass
+from fitact.model.response import drive_voltage, highpass
 from fitact.scene.scene import Scene
 from fitact.scene.sections import DriveSection
 from fitact.units import format_percent
@@ -70,7 +70,7 @@ def choose_drive(record: Record, scene: Scene | None) -> DriveModel:
             f"{record.source}: the sine does not start at phase zero as in the scene; without V_V, the phase of the"
             " drive cannot be separated from that of the circuit; record V_V, or set t = 0 at its upward zero crossing"
         )
-    voltage = _voltage(drive, record.time - shift, scene.drive.steady_state)
+    voltage = evaluate_voltage(drive, record.time - shift, scene.drive.steady_state)
     if shift != 0.0:
         notes.append(f"the scene's drive was shifted by {shift:.4g} s to match the record")
     if "V" in record:
@@ -225,24 +225,13 @@ def has_ideal_edges(drive: Drive) -> bool:
 
 def ideal_edge_mask(drive: Drive, time: np.ndarray, margin: float) -> Bool[np.ndarray, " samples"]:
     """Return which times lie within `margin` (s) of an ideal edge of a square wave."""
-    before, after = (_voltage(drive, t, True) for t in (time - margin, time + margin))
+    before, after = (evaluate_voltage(drive, t, True) for t in (time - margin, time + margin))
     return np.abs(after - before) > 1e-9 * np.ptp(after)
-
-
-def _voltage(drive: Drive, time: np.ndarray, steady_state: bool) -> np.ndarray:
-    """Return the drive at `time`; a drive from rest is zero before t = 0."""
-    return np.asarray(_value(drive, pad_samples(time), steady_state))[: time.size]
-
-
-@jit
-def _value(drive: Drive, time: ArrayLike, steady_state: bool) -> Array:
-    voltage = drive.value(time)
-    return voltage if steady_state else jnp.where(time < 0.0, 0.0, voltage)
 
 
 @functools.partial(jit, fast=True)
 def _shifted_voltages(drive: Drive, time: Array, shifts: Array, steady_state: bool) -> Float[Array, "shifts times"]:
-    return jax.vmap(lambda shift: _value(drive, time - shift, steady_state))(shifts)
+    return jax.vmap(lambda shift: drive_voltage(drive, time - shift, steady_state=steady_state))(shifts)
 
 
 def drive_slope(choice: DriveModel, time: np.ndarray) -> Float[np.ndarray, " samples"]:
