@@ -7,7 +7,6 @@ identified. Such directions are the null space of the first derivatives of the g
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,48 +23,20 @@ GAIN_CHANNELS: dict[str, Channel] = {"gain": "Vsc", "gain_I": "I"}  # channels b
 STRAY = "stray_capacitance"  # name of the parameter of panel and cable, whose current I includes
 
 
-class StructuralIdentifiability(NamedTuple):
-    """Directions that no record of these channels determines."""
-
-    names: tuple[str, ...]  # free parameters
-    channels: tuple[Channel, ...]  # recorded in addition to V
-    directions: Float[np.ndarray, "dimension parameters"]  # unit vectors in the log-parameters, at the circuit's values
-    is_constant: bool  # whether the directions are the same for all values
-
-    @property
-    def dimension(self) -> int:
-        """Number of independent combinations that are not identified."""
-        return len(self.directions)
-
-    def contains(self, direction: dict[str, float], *, max_sine: float = 0.1) -> bool:
-        """Return whether a direction in some of the log-parameters is unidentified, for any change of the others."""
-        if self.dimension == 0:
-            return False
-        part = self.directions[:, [self.names.index(name) for name in direction]]
-        return _subspace_distance(part, np.array([list(direction.values())])) < max_sine
-
-    def __str__(self) -> str:
-        channels = " and ".join(self.channels)
-        if self.dimension == 0:
-            return f"A record of {channels} can determine {', '.join(self.names)}."
-        what = "; ".join(name_direction(dict(zip(self.names, row, strict=True))) for row in self.directions)
-        here = "" if self.is_constant else " (direction at these values; elsewhere it differs)"
-        return f"No record of {channels}{' alone' * (len(self.channels) == 1)} can determine {what}{here}."
-
-
 def blind_directions(
     circuit: Circuit,
     free: Sequence[str],
     channels: Sequence[Channel],
     stray_capacitance: float = 0.0,
     min_sine: float = 1e-6,
-) -> StructuralIdentifiability:
-    """Find the directions in the logarithms of `free` that no record of `channels` determines.
+) -> Float[np.ndarray, "dimension parameters"]:
+    """Find the directions in the logarithms of `free` that no record of `channels` determines, as unit vectors.
 
     `free` names fields of the circuit, "gain" (of the channel Vsc), "gain_I" and "stray_capacitance", which has this
     value (F); all else is known. The circuit's values may be special (two equal skins). A direction therefore counts
     only if it is unidentified there and at `points` random values around them, each up to a factor of 10 away.
-    Directions count as equal if the sine of the angle between them is below `min_sine`.
+    They are those at the circuit's values, and elsewhere may differ. Ci increases along them, unless it changes by less
+    than `min_sine`.
     """
     free, channels, points = tuple(free), tuple(channels), 8
     spread = np.array([0.1 if name == "alpha" else math.log(10.0) for name in free])  # alpha is at most 1
@@ -74,13 +45,25 @@ def blind_directions(
     with double_precision():
         slopes = _log_gain_slopes(as_arrays(circuit), thetas, free, channels, np.asarray(stray_capacitance))
     null_spaces = [_null_space(np.concatenate([slope.real, slope.imag])) for slope in slopes]
-    dimension = min(len(directions) for directions in null_spaces)
-    generic = [directions for directions in null_spaces if len(directions) == dimension]
-    constant = dimension == 0 or all(_subspace_distance(generic[0], other) < min_sine for other in generic)
-    directions = _sparse_basis(generic[0])
+    dimension = min(map(len, null_spaces))
+    directions = _sparse_basis(next(each for each in null_spaces if len(each) == dimension))
     if "Ci" in free:
         directions[directions[:, free.index("Ci")] < -min_sine] *= -1.0
-    return StructuralIdentifiability(free, channels, directions, constant)
+    return directions
+
+
+def is_blind(
+    directions: Float[np.ndarray, "dimension parameters"],
+    free: Sequence[str],
+    direction: dict[str, float],
+    max_sine: float = 0.1,
+) -> bool:
+    """Return whether a direction in some of `free` lies in these `blind_directions`, for any change of the others."""
+    if not len(directions):
+        return False
+    part, wanted = directions[:, [free.index(name) for name in direction]], np.array(list(direction.values()))
+    inside = wanted @ np.linalg.pinv(part, rcond=1e-6) @ part  # projected directions may be parallel
+    return bool(np.linalg.norm(wanted - inside) < max_sine * np.linalg.norm(wanted))
 
 
 def gain_names(channels: Sequence[Channel]) -> dict[str, Channel]:
@@ -187,14 +170,6 @@ def _null_space(sensitivity: Float[np.ndarray, "rows parameters"]) -> Float[np.n
     if not null.any() or sizes[null].max() > gap * sizes[~null].min():
         return np.zeros((0, scale.size))
     return np.linalg.qr((directions[null] / scale).T)[0].T
-
-
-def _subspace_distance(
-    directions: Float[np.ndarray, "n parameters"], others: Float[np.ndarray, "m parameters"]
-) -> float:
-    """Return the sine of the largest angle between `others` and the space of `directions`."""
-    inside = others @ np.linalg.pinv(directions, rcond=1e-6) @ directions  # projected directions may be parallel
-    return float(np.linalg.norm((others - inside) / np.linalg.norm(others, axis=1, keepdims=True), 2))
 
 
 def _sparse_basis(basis: Float[np.ndarray, "dimension parameters"]) -> Float[np.ndarray, "dimension parameters"]:

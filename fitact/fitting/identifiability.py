@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.compiled import double_precision
-from fitact.experiment.blind_directions import blind_directions, gain_names, name_direction
+from fitact.experiment.blind_directions import blind_directions, gain_names, is_blind, name_direction
 from fitact.experiment.experiment import CandidateDesign, DesignOption
 from fitact.experiment.fisher import Experiment
 from fitact.experiment.options import NEEDS, suggest_measurements
@@ -74,7 +74,7 @@ class Identifiability:
             return NextMeasurement(is_gain, f"{force}; {advice}", advice[0].upper() + advice[1:])
         with double_precision():
             stray = experiment.stray_capacitance
-            structure = blind_directions(experiment.circuit, experiment.free, experiment.channels, stray)
+            blind = blind_directions(experiment.circuit, experiment.free, experiment.channels, stray)
             present = CandidateDesign.from_fit(experiment, self.force_gradient, self.force_sd)
             options = suggest_measurements(present, self.force_gradient)
         figures = [f"{show(option.force_sd, after)} with {option.text}" for option in options]
@@ -84,13 +84,13 @@ class Identifiability:
             most = max(self.blind_direction, key=lambda name: abs(self.blind_direction[name]))
             what = "Ci and this contact area" if most in FINGER_PARAMETERS else most
             hints.append(f"No prior narrows that direction; state one for {what} under [prior].")
-        gains = structure.directions[:, [name in gain_names(structure.channels) for name in structure.names]]
+        gains = blind[:, [name in gain_names(experiment.channels) for name in experiment.free]]
         if np.any(np.abs(gains) > 0.1):  # components of a unit vector above this belong to a direction
             hints.append(
                 "The free gain is confounded with the circuit; calibrate the probe and sample each edge several times."
             )
         remedy = " ".join((expected, *hints))
-        return NextMeasurement(structure.contains(self.blind_direction), remedy, " ".join(hints), options)
+        return NextMeasurement(is_blind(blind, experiment.free, self.blind_direction), remedy, " ".join(hints), options)
 
     @property
     def structural(self) -> bool:
