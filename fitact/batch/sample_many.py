@@ -81,8 +81,8 @@ def sample_many(
     return tabulate_records(records, scene, columns, make_rows, title)
 
 
-class _Target(NamedTuple):
-    """Posterior of a record that was fitted in a batch.
+class _FittedRecord(NamedTuple):
+    """Record that was fitted in a batch, to be sampled.
 
     Attributes:
         row: row of its fit.
@@ -100,20 +100,20 @@ class _Target(NamedTuple):
 def _sample_rows(batches: Iterable[Batch], scene: Scene | None, seed: int) -> Iterator[tuple[int, Row]]:
     """Yield the number and the row of each record when it is finished."""
     jobs = (
-        (member, targets.get(member[0]))
-        for (_, members), targets in run_in_threads(batches, _make_targets)
+        (member, fitted.get(member[0]))
+        for (_, members), fitted in run_in_threads(batches, _list_fitted)
         for member in members
     )
     for ((number, record), _), row in run_in_threads(jobs, functools.partial(_sample_record, seed=seed)):
         yield number, row or _alone(record, scene, seed)
 
 
-def _make_targets(batch: Batch) -> dict[int, _Target]:
+def _list_fitted(batch: Batch) -> dict[int, _FittedRecord]:
     """Return the accepted records of a batch by their number."""
     (problem, members), (rows, optima) = batch, fit_batch(batch)
-    targets: dict[int, _Target] = {}
+    fitted: dict[int, _FittedRecord] = {}
     if problem is None or optima is None:
-        return targets
+        return fitted
     log_sigma_sd = (scale_information("white") * (problem.samples - optima.theta.shape[1])) ** -0.5
     for place, (number, record) in enumerate(members):
         if number in rows:
@@ -122,12 +122,12 @@ def _make_targets(batch: Batch) -> dict[int, _Target]:
             derive = problem.derive_record(record, inputs, likelihood)
             center = np.append(optima.theta[place], np.log(optima.sigma[place]))
             factor = scipy.linalg.block_diag(optima.covariance_factor[place], log_sigma_sd)
-            targets[number] = _Target(rows[number], likelihood, derive, center, factor)
-    return targets
+            fitted[number] = _FittedRecord(rows[number], likelihood, derive, center, factor)
+    return fitted
 
 
 def _sample_record(
-    job: tuple[Member, _Target | None],
+    job: tuple[Member, _FittedRecord | None],
     seed: int,
     draws: int = 8192,
     derived_draws: int = 2048,
@@ -137,17 +137,17 @@ def _sample_record(
 
     Derived quantities, which cost more, are computed for the first `derived_draws` of the draws.
     """
-    (_, record), target = job
-    if target is None:
+    (_, record), fitted = job
+    if fitted is None:
         return None
-    random, likelihood = np.random.default_rng([seed, int(record.fingerprint, 16)]), target.likelihood
-    z = draw_student_t(random, draws, target.center.size)
-    points = target.center + z @ target.factor.T
+    random, likelihood = np.random.default_rng([seed, int(record.fingerprint, 16)]), fitted.likelihood
+    z = draw_student_t(random, draws, fitted.center.size)
+    points = fitted.center + z @ fitted.factor.T
     log_ratios = _evaluate_log_probs(likelihood, points) - student_log_density(z)
     if np.isnan(log_ratios).any():  # outside the table
         return None
     deviates = random.standard_normal((derived_draws, 1, len(LINEAR_NUISANCES)))
-    quantities = _derive_draws(target.derive, points[:derived_draws], deviates)
+    quantities = _derive_draws(fitted.derive, points[:derived_draws], deviates)
     weights, names = pareto_smooth(log_ratios), (*likelihood.names, "sigma")
     drawn = dict(zip((*names, *derived.DERIVED_NAMES), (*points.T, *quantities.T), strict=True))
     tracked = {name: drawn[name] for name in (*names, *_TRACKED)}
@@ -155,7 +155,7 @@ def _sample_record(
     if not (convergence.converged and convergence.ess_min >= min_effective):
         return None
     natural = {name: np.exp(values) if name in names else values for name, values in drawn.items()}
-    return target.row | _posterior_columns(target.row, natural, convergence, weights)
+    return fitted.row | _posterior_columns(fitted.row, natural, convergence, weights)
 
 
 @functools.partial(jit, fast=True)
