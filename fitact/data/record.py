@@ -136,7 +136,8 @@ class Record(Display):
         """The few sinusoids of which V consists, or None."""
         if not is_uniform(self.time):
             return None
-        return find_tones(self["V"], (self.frequency("V") or math.inf) * self.time_step)
+        frequency = (self.frequency("V") or math.inf) * self.time_step
+        return find_tones(self["V"], frequency, rounding_noise_sd(self["V"]))
 
     @property
     def leading(self) -> str:

@@ -21,11 +21,15 @@ class Tones(NamedTuple):
     phasors: Complex[np.ndarray, " tones"]  # A
     frequencies: Float[np.ndarray, " tones"]  # w, rad per sample
     size: int  # number of samples
+    rounding: float = 0.0  # sd of the rounding of the samples
 
     @classmethod
-    def from_samples(cls, values: Samples, frequencies: Float[np.ndarray, " tones"], rounds: int = 8) -> Self:
+    def from_samples(
+        cls, values: Samples, frequencies: Float[np.ndarray, " tones"], rounding: float = 0.0, rounds: int = 8
+    ) -> Self:
         """Fit all parameters by least squares; `frequencies` are a start, better than half a cycle per record."""
-        tones, count = cls(0.0, np.zeros(frequencies.size, complex), frequencies, values.size), frequencies.size
+        count = frequencies.size
+        tones = cls(0.0, np.zeros(count, complex), frequencies, values.size, rounding)
         for number in range(rounds):
             products = np.zeros(2 * [2 + 3 * count])
             for first in range(0, values.size, _SOME):
@@ -49,8 +53,8 @@ class Tones(NamedTuple):
 
     def continue_with(self, values: Samples) -> Self | None:
         """Return the tones of other samples of the signal, or None if they are not the same."""
-        tones = self.from_samples(values, self.frequencies)
-        return tones if _is_noise(values - tones.values(), values) else None
+        tones = self.from_samples(values, self.frequencies, self.rounding)
+        return tones if _is_noise(values - tones.values(), self.rounding) else None
 
     @property
     def carrier(self) -> float | None:
@@ -95,13 +99,18 @@ class Tones(NamedTuple):
 
 
 def find_tones(
-    values: Samples, frequency: float, max_tones: int = 8, cycles: float = 8.0, max_distortion: float = 0.03
+    values: Samples,
+    frequency: float,
+    rounding: float = 0.0,
+    max_tones: int = 8,
+    cycles: float = 8.0,
+    max_distortion: float = 0.03,
 ) -> Tones | None:
     """Return the few tones of which a signal consists, or None if more remains than white noise and rounding.
 
-    `frequency` is that with which it repeats (cycles per sample), or infinite. Below a number of `cycles`, a spectrum
-    does not tell a tone from the mean. It hides tones up to `max_distortion` of the others, which are added; an edge
-    has many.
+    `frequency` is that with which it repeats (cycles per sample), or infinite; `rounding` is the sd of its rounding
+    errors. Below a number of `cycles`, a spectrum does not tell a tone from the mean. It hides tones up to
+    `max_distortion` of the others, which are added; an edge has many.
     """
     size = some = min(values.size, _SOME)
     found, height = _find_lines(values[:some] - values[:some].mean())
@@ -111,9 +120,9 @@ def find_tones(
         return None
     found = found[height > max_distortion]
     while 0 < found.size <= max_tones:
-        tones = Tones.from_samples(values[:size], found)
+        tones = Tones.from_samples(values[:size], found, rounding)
         found, rest = tones.frequencies, values[:size] - tones.values()
-        if not _is_noise(rest, values[:size]):
+        if not _is_noise(rest, rounding):
             added, height = _find_lines(rest[:_SOME])
             cycle, is_carrier = 2.0 * np.pi / size, np.min(found) > 2.0 * np.pi * cycles / some
             apart = np.abs(added[:, None] - found).min(axis=1, initial=np.inf) > cycle
@@ -129,13 +138,12 @@ def find_tones(
     return None
 
 
-def _is_noise(rest: Samples, values: Samples, block: int = 32) -> bool:
+def _is_noise(rest: Samples, rounding: float, block: int = 32) -> bool:
     """Return whether the rest of a signal is white noise: neighbours differ as much as all, and means of blocks hardly.
 
-    The rounding of the values may be the same for some samples.
+    Rounding errors, of this sd, may be the same for some samples.
     """
     white = float(np.std(np.diff(rest, 3))) / np.sqrt(20.0)
-    rounding = float(np.min(np.diff(np.unique(values[:_SOME])), initial=np.inf)) / np.sqrt(12.0)
     means = rest[: rest.size // block * block].reshape(-1, block).mean(axis=1)
     is_alike = np.std(rest) < 1.5 * max(white, rounding)
     return bool(is_alike and np.std(means) < max(2.0 * white / np.sqrt(block), rounding))

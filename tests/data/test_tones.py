@@ -5,6 +5,7 @@ import pytest
 import scipy.signal
 
 import fitact
+from fitact.data.record import rounding_noise_sd
 from fitact.data.tones import find_tones
 
 # amplitude (V) and frequency (cycles per sample) of each tone
@@ -30,7 +31,7 @@ def record_tones(name: str, bits: int, noise: float, samples: int = 6000) -> tup
 @pytest.mark.parametrize("name", list(DRIVES))
 def test_tones_are_as_certain_as_noise_allows(name: str, bits: int):
     recorded, V = record_tones(name, bits, 0.2)
-    tones = find_tones(recorded, min(f for _, f in DRIVES[name]))
+    tones = find_tones(recorded, min(f for _, f in DRIVES[name]), rounding_noise_sd(recorded))
     assert tones is not None
     assert len(tones.frequencies) == len(DRIVES[name])
     parameters, error = 1 + 3 * len(DRIVES[name]), np.std(recorded - V)
@@ -89,3 +90,18 @@ def test_other_drives_have_no_tones(periods: float):
     }
     for name, V in drives.items():
         assert find_tones(V + 0.1 * rng.standard_normal(k.size), periods / k.size) is None, name
+
+
+@pytest.mark.parametrize("drive", ["square", "dead time", "triangle", "stairs"])
+def test_few_levels_of_an_ideal_drive_are_no_rounding(drive: str):
+    """The step between the two levels of a square was taken for that of a converter, and the square for a sine."""
+    phase = np.arange(1000) % 500 / 500.0
+    V = {
+        "square": np.where(phase < 0.5, 180.0, -180.0),
+        "dead time": np.where(phase % 0.5 < 0.1, 0.0, np.where(phase < 0.5, 180.0, -180.0)),
+        "triangle": 180.0 * scipy.signal.sawtooth(2.0 * np.pi * np.round(20.0 * phase) / 20.0, 0.5),
+        "stairs": np.round(3.0 * np.sin(2.0 * np.pi * phase)),
+    }[drive]
+    record = fitact.Record.from_arrays(2e-5 * np.arange(V.size), V=V, Vsc=0.1 * V)
+    assert record.tones is None
+    assert record.noise("V") < 1e-9
