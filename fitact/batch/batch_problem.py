@@ -126,9 +126,9 @@ class BatchProblem(abc.ABC):
         records = [record for _, record in members]
         return records + records[-1:] * (self.unit - len(records))
 
-    def derive_record(self, record: Record, inputs: RecordInputs, likelihood: Likelihood) -> DerivedQuantities:
-        """Return the derived quantities of a record, whose likelihood is that of `inputs`."""
-        return dataclasses.replace(self.derive, likelihood=likelihood)
+    def derive_record(self, record: Record, inputs: RecordInputs) -> DerivedQuantities:
+        """Return the derived quantities of a record with these `inputs`, and its likelihood in them."""
+        return dataclasses.replace(self.derive, likelihood=inputs.model(self.likelihood))
 
     @functools.cached_property
     def names(self) -> tuple[str, ...]:

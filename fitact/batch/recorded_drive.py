@@ -161,12 +161,12 @@ class RecordedDriveProblem(BatchProblem):
         interpolation = optimum.gain * interpolation_errors(V, driven.noise)
         return self.assess_optima(inputs, optima, square, tests, expected, usable, (logs, gradients), interpolation)
 
-    def derive_record(self, record: Record, inputs: RecordInputs, likelihood: Likelihood) -> DerivedQuantities:
-        """Return the derived quantities of a record, with its own drive."""
+    def derive_record(self, record: Record, inputs: RecordInputs) -> DerivedQuantities:
+        """Return the derived quantities of a record with these `inputs` and its own drive."""
         V, size = record["V"][None], self.derive.time.size
         noise = _drive_noise(V, Screening.from_values(V, self.settings))
         table = _tabulate_responses(self.shared, self.evaluated.start, size, inputs.table["center"], V[0], noise[0])
-        return dataclasses.replace(self.derive, likelihood=likelihood, drive=table)
+        return dataclasses.replace(super().derive_record(record, inputs), drive=table)
 
     def _is_whole_drive(
         self, V: Float[np.ndarray, "records samples"], driven: Screening

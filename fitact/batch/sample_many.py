@@ -86,12 +86,12 @@ class _FittedRecord(NamedTuple):
 
     Attributes:
         row: row of its fit.
+        derive: its derived quantities, with its likelihood.
         center: optimum, theta and log sigma.
         factor: factor of the covariance.
     """
 
     row: Row
-    likelihood: Likelihood
     derive: DerivedQuantities
     center: Float[np.ndarray, " n"]
     factor: Float[np.ndarray, "n n"]
@@ -118,11 +118,10 @@ def _list_fitted(batch: Batch) -> dict[int, _FittedRecord]:
     for place, (number, record) in enumerate(members):
         if number in rows:
             inputs = jax.tree.map(operator.itemgetter(place), optima.inputs)
-            likelihood = inputs.model(problem.likelihood)
-            derive = problem.derive_record(record, inputs, likelihood)
+            derive = problem.derive_record(record, inputs)
             center = np.append(optima.theta[place], np.log(optima.sigma[place]))
             factor = scipy.linalg.block_diag(optima.covariance_factor[place], log_sigma_sd)
-            fitted[number] = _FittedRecord(rows[number], likelihood, derive, center, factor)
+            fitted[number] = _FittedRecord(rows[number], derive, center, factor)
     return fitted
 
 
@@ -140,7 +139,7 @@ def _sample_record(
     (_, record), fitted = job
     if fitted is None:
         return None
-    random, likelihood = np.random.default_rng([seed, int(record.fingerprint, 16)]), fitted.likelihood
+    random, likelihood = np.random.default_rng([seed, int(record.fingerprint, 16)]), fitted.derive.likelihood
     z = draw_student_t(random, draws, fitted.center.size)
     points = fitted.center + z @ fitted.factor.T
     log_ratios = _evaluate_log_probs(likelihood, points) - student_log_density(z)

@@ -125,9 +125,11 @@ class Record(Display):
         """Return the sd of white noise, and that of rounding (see `noise`)."""
         if ("noise", channel) not in self._estimates:
             values = self[channel] if channel == "V" else self[channel][~clipping_mask(self[channel])]
-            white, rounding = white_noise_sd(values), rounding_noise_sd(values)
             if channel == "V" and self.tones is not None:
+                rounding = self.tones.rounding
                 white = math.sqrt(max(float(np.var(values - self.tones.values())) - rounding**2, 0.0))
+            else:
+                white, rounding = white_noise_sd(values), rounding_noise_sd(values)
             self._estimates["noise", channel] = white, rounding
         return self._estimates["noise", channel]
 

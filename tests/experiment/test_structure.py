@@ -1,5 +1,7 @@
 """Blind directions against coefficients of the transfer functions, impedances, and scipy's null space."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import scipy.linalg
@@ -86,6 +88,9 @@ def test_constant_directions_leave_the_channels_as_they_are_far_along(case: str)
     circuit, free, channels, _ = CASES[case]
     found = blind_directions(circuit, free, channels)
     values, omega = dict.fromkeys(free, 1.0) | given(circuit), np.geomspace(1e-1, 1e9, 50)
+    elsewhere = dataclasses.replace(circuit, **{name: 3.0 * value for name, value in given(circuit).items()})
+    elsewhere = dataclasses.replace(elsewhere, Csc=5.0 * elsewhere.Csc)
+    np.testing.assert_allclose(blind_directions(elsewhere, free, channels), found, atol=1e-6)
     moved = values | {n: values[n] * np.exp(3.0 * d) for n, d in zip(free, found[0], strict=True)}
     for channel in channels:
         np.testing.assert_allclose(gain(moved, channel, omega), gain(values, channel, omega), rtol=1e-10)
@@ -98,6 +103,7 @@ def test_contact_area_is_named():
     assert name_direction(dict(zip(SKIN, found[0], strict=True))) == area
     assert is_blind(found, SKIN, {"Rsc": -0.58, "Csc": 0.58, "Ci": 0.57})
     assert not is_blind(found, SKIN, {"Rsc": 0.58, "Csc": 0.58, "Ci": 0.57})
+    assert len(blind_directions(FINAL, SKIN, ("Vsc", "I"))) == 0
     assert blind_directions(FINAL, ("Rsc", "Ci", "gain"), ("Vsc",))[0, 1] > 0.0  # that of a larger Ci
 
 
@@ -108,6 +114,8 @@ def test_free_gain_hides_behind_the_divider_along_a_curved_ridge():
     expected = np.array([-1.0, (2.0 * Ci + Csc) / Csc, 0.0, 1.0])
     np.testing.assert_allclose(found[1], expected / np.linalg.norm(expected), atol=1e-12)
     assert "gain" in name_direction(dict(zip((*SKIN, "gain"), found[1], strict=True)))
+    elsewhere = blind_directions(dataclasses.replace(FINAL, Csc=5.0 * Csc), (*SKIN, "gain"), ("Vsc",))
+    assert scipy.linalg.subspace_angles(elsewhere.T, found.T).max() > 0.01
 
 
 @pytest.mark.parametrize("R_H", [500.0, 1.0, 1e-6])

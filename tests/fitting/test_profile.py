@@ -117,6 +117,7 @@ def test_criteria_of_a_regression_in_closed_form():
     residuals = y - (x @ y) / (x @ x) * x
     likelihood = scipy.stats.norm.logpdf(residuals, scale=np.sqrt(np.mean(residuals**2))).sum()
     found = criteria(likelihood, 2, 40)
+    assert found["log_likelihood"] == pytest.approx(likelihood, rel=1e-12)
     assert found["aic"] == pytest.approx(4.0 - 2.0 * likelihood, rel=1e-12)
     assert found["aicc"] == pytest.approx(4.0 - 2.0 * likelihood + 12.0 / 37.0, rel=1e-12)
     assert found["bic"] == pytest.approx(2.0 * np.log(40.0) - 2.0 * likelihood, rel=1e-12)
