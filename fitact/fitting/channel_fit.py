@@ -170,7 +170,7 @@ def _gain(optimum: CircuitValues, channel: ChannelLikelihood) -> float:
         return 0.0
     if isinstance(optimum.circuit, WithSkin):  # the gain falls with frequency, and most of the noise is fast
         return float(np.abs(_channel_gain(optimum.circuit, channel.channel, 1.0 / channel.timing.step)))
-    return abs(float(np.sum(optimum.terms[channel.channel].weight)))
+    return abs(float(optimum.terms[channel.channel].gain_in_step(float(channel.timing.step))))
 
 
 @jit

@@ -115,25 +115,26 @@ def _rows_at(
     delay = float(full.timing.shift) / current.step + float(np.clip(skew, -0.5, 0.5))
     delay = float(np.clip(delay, 0.5 - MAX_STEPS, MAX_STEPS - 0.5))
 
-    @functools.lru_cache(maxsize=1)
-    def respond_to_V() -> tuple[np.ndarray, np.ndarray]:
-        return _modelled_rows(_with_drive(full, current, current.V), inputs, sizes)
+    modelled = Current.from_channel(channel, inputs, delay)
+
+    def respond_with_nuisances(V: Rows) -> tuple[np.ndarray, np.ndarray]:
+        return _modelled_rows(_with_drive(full, current, V, modelled.lag), inputs, sizes)
+
+    respond_to_V = functools.cache(lambda: respond_with_nuisances(current.V))
 
     def respond(V: Rows) -> Rows:
-        pair = respond_to_V() if V is current.V else _modelled_rows(_with_drive(full, current, V), inputs, sizes)
-        return np.asarray(pair[0])[:size]
+        return np.asarray((respond_to_V() if V is current.V else respond_with_nuisances(V))[0])[:size]
 
-    modelled = Current.from_channel(channel, inputs, delay)
     return *current.make_rows(modelled, respond, np.asarray(respond_to_V()[1])[:size]), delay * current.step
 
 
-def _with_drive(channel: ChannelLikelihood, current: RecordedCurrent, V: Rows) -> ChannelLikelihood:
-    """Return the channel of a current that is 0, with another drive."""
+def _with_drive(channel: ChannelLikelihood, current: RecordedCurrent, V: Rows, lag: float) -> ChannelLikelihood:
+    """Return the channel of a current that is 0, with another drive and a `lag` (time steps)."""
     charges, drive = channel.samples.charges, channel.electrical.drive
     assert charges is not None
     assert isinstance(drive, Sampled)
     length = np.shape(channel.samples.time)[0]
-    rise = np.pad(current.rise(V), (0, length - V.size))
+    rise = np.pad(current.rise(V, lag), (0, length - V.size))
     charges = dataclasses.replace(charges, observed=np.zeros(length), rate=rise)
     return channel.replace_observable(drive=Sampled(drive.time, pad_samples(V))).replace_samples(charges=charges)
 

@@ -38,9 +38,9 @@ def solve_problem(
     not reach far enough, they are made again around the optimum, as wide as possible; the samples of channels whose
     table still fails are summed from there on.
 
-    A start far from the answer may lead delays astray, by more steps than the rounds lead them back. A fit that has not
-    settled, with a delay of more than `max_late` prior standard deviations, starts again from its circuit, without its
-    delays, at most `max_restarts` times.
+    A start far from the answer may lead delays astray, to where no table reaches. A search that fails with a delay of
+    more than `max_late` prior standard deviations starts again from its circuit, without its delays, at most
+    `max_restarts` times.
     """
     first = problem
     noise, theta = [source.noise for source in problem.sources], choose_start(problem, start)
@@ -55,6 +55,10 @@ def solve_problem(
         likelihood = start_delays(likelihood, theta) if round_number == 0 else likelihood
         problem = problem._replace(likelihood=likelihood)
         solved = _solve(problem, tolerance, full, theta)
+        if max_restarts and solved.result != "successful" and _largest_delay(solved) > max_late:
+            circuit = len(first.likelihood.prior.names)
+            again = first._replace(start=np.append(solved.theta[:circuit], first.start[circuit:]))
+            return solve_problem(again, tolerance, None, max_restarts=max_restarts - 1)
         root, places = solved.covariance_factor(), _find_places(solved, likelihood)
         theta, steps = solved.theta[places], steps + solved.steps
         if best is None or not has_rows or solved.log_density > best[2].log_density:
@@ -87,10 +91,6 @@ def solve_problem(
             break
     assert best is not None
     problem, reasons, solved = best
-    if max_restarts and _largest_delay(solved) > max_late:
-        circuit = len(first.likelihood.prior.names)
-        again = first._replace(start=np.append(solved.theta[:circuit], first.start[circuit:]))
-        return solve_problem(again, tolerance, None, max_restarts=max_restarts - 1)
     root = solved.covariance_factor()
     certified, failed = _certify(solved, root, reasons, tolerance)
     while failed:

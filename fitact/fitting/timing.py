@@ -19,7 +19,7 @@ from fitact.likelihood.observable import TIMING_NUISANCES, ChannelInputs
 from fitact.likelihood.smooth_drive import curve_drive
 from fitact.model.drive import Sampled
 from fitact.model.response import highpass
-from fitact.model.skin import constant_skin_circuit
+from fitact.model.skin import constant_skin_circuit, limits_current
 from fitact.problem.build import smooth_recorded_drive
 from fitact.problem.drive_choice import has_ideal_edges, has_unresolved_edge, ideal_edge_mask
 from fitact.problem.source import Source
@@ -129,8 +129,11 @@ def curve_drives(
         assert isinstance(drive, Sampled)
         assert smooth is not None
         late = theta[likelihood.names.index(channel.qualified_name("delay"))]
-        late += float(channel.timing.shift) / float(channel.timing.step)
-        curved = pad_samples(curve_drive(smooth[: len(record)], late, record.tones))
+        step, lag = float(channel.timing.step), 0.0
+        late += float(channel.timing.shift) / step
+        if limits_current(likelihood.template):  # whose resistance makes Vsc later, too
+            lag = min(float(likelihood.evaluate_circuit(theta).tau[-1]) / step, 1.0)
+        curved = pad_samples(curve_drive(smooth[: len(record)], late, record.tones, lag))
         changes = np.asarray(electrical.noise_gain) * (curved - now) / sigma[i]
         if np.linalg.norm(changes * np.sqrt(channel.samples.weights)) > max_change:
             drive = dataclasses.replace(drive, samples=curved + (np.asarray(drive.samples) - now))

@@ -260,6 +260,8 @@ class Compression(eqx.Module):
         middle = round(0.5 * (low + high))
         ages = 2 if max(high - middle, middle - low) <= 2.0 else self.reach  # two sizes, so that records share programs
         middle = min(max(middle, ages - self.reach), self.reach - ages)
+        if abs(middle) * float(self.time_step) > 20.0 * np.min(tau):  # the way back would lose all digits
+            return signal, voltage, np.asarray(self.steps), float(self.origin)
         first = middle - ages + self.reach
         origin = float(self.origin) + middle
         since = np.asarray(origin * float(self.time_step))

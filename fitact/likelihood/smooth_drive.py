@@ -54,12 +54,16 @@ def lasting_bend(V: Any) -> Any:
     return xp.maximum(xp.minimum(before, after), xp.minimum(xp.maximum(before, after), here))
 
 
-def curve_drive(smooth: Any, late: float, tones: Tones | None) -> Any:
+def curve_drive(smooth: Any, late: float, tones: Tones | None, lag: float = 0.0) -> Any:
     """Return a smooth drive (samples, V) between whose samples lines are a curve, where it is `late` (time steps).
 
-    That of a drive of few tones is known; others lack a part of their second differences.
+    That of a drive of few tones is known; others lack a part of their second differences. A low-pass with the time
+    constant `lag` (time steps) reads the drive later by an exponential distribution.
     """
-    return smooth + missing_curve(late) * lasting_bend(smooth) if tones is None else tones.values_for_lines(late)
+    lates = late - lag * np.log1p(-(np.arange(16) + 0.5) / 16.0) if lag else np.array([late])
+    if tones is None:
+        return smooth + np.mean(missing_curve(lates)) * lasting_bend(smooth)
+    return sum(map(tones.values_for_lines, lates)) / lates.size
 
 
 def missing_curve(late: ArrayLike) -> ArrayLike:

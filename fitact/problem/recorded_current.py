@@ -47,6 +47,7 @@ class Current(NamedTuple):
     capacitance: float  # that follows dV/dt, with the stray one, F
     conductance: float  # of what does not follow it, S
     delay: float  # against V, in time steps
+    lag: float = 0.0  # time constant of a resistance that makes it later, a part of the delay, in time steps
 
     @classmethod
     def from_channel(cls, channel: ChannelLikelihood, inputs: ChannelInputs, delay: float | None = None) -> Self:
@@ -54,12 +55,13 @@ class Current(NamedTuple):
 
         If a resistance limits the current, its capacitance is that whose rows have the same variance.
         """
-        terms = channel.electrical.select_terms(inputs.circuit.channel_terms(channel.channel))
-        step = float(channel.timing.step)
+        terms, step = inputs.circuit.channel_terms(channel.channel), float(channel.timing.step)
+        lag = float(terms.tau[-1]) / step if channel.electrical.lags else 0.0
+        terms = channel.electrical.select_terms(terms)
         stray = 0.0 if inputs.stray is None else float(inputs.stray)
         delay = float(channel.timing.shift) / step if delay is None else delay
         if terms.rate is not None:
-            return cls(float(terms.rate) + stray, float(np.sum(terms.weight)), delay)
+            return cls(float(terms.rate) + stray, float(np.sum(terms.weight)), delay, lag)
         omega = math.pi / step * (np.arange(64) + 0.5) / 64.0
         gain = np.asarray(gain_at(terms, omega)) + 1j * omega * stray
         mean_square = float(np.mean(np.abs(gain * np.sinc(0.5 * omega * step / math.pi)) ** 2))
@@ -241,8 +243,15 @@ class RecordedCurrent:
         taps, _ = mean_filter(delay)
         return float(np.sinc(frequency / (2.0 * math.pi)) / abs(np.exp(-1j * frequency * np.arange(taps.size)) @ taps))
 
-    def rise(self, V: Rows) -> Rows:
-        """Return the rise of a drive over each step, V/s, stored as rows are."""
+    def rise(self, V: Rows, lag: float = 0.0) -> Rows:
+        """Return the rise of a drive over each step, V/s, stored as rows are.
+
+        With a `lag` (time steps) it is that of the drive behind a low-pass of this time constant, which weakens what is
+        fast besides making it later: 1 / (1 + s) = e^{-s} (1 + s^2 / 2 + ...).
+        """
+        if lag:
+            bend = self.lasting_bend  # from which its own bend leads to the second derivative
+            V = V + 0.5 * lag**2 * (bend - lasting_bend(bend) / 12.0)
         return np.concatenate([np.zeros(LAG), np.diff(V)[: 1 - LAG] / self.step])
 
     def make_rows(
@@ -262,7 +271,7 @@ class RecordedCurrent:
         observed = means + respond(V) - from_V
         power = np.mean(self._noise_power(np.linspace(0.0, 0.5, 129), modelled))
         gain, decay = covariance.recursion(self._floor / math.sqrt(float(power)))
-        return ChargeRows(observed, self.rise(V), bend, gain, decay, covariance.used * 1.0), V
+        return ChargeRows(observed, self.rise(V, modelled.lag), bend, gain, decay, covariance.used * 1.0), V
 
     def _estimate_drive(self, covariance: RowCovariance, residuals: Rows, modelled: Current) -> Rows:
         """Return V without the noise that the residuals of the rows tell."""

@@ -129,16 +129,15 @@ def skin_from_estimates(vsc: VscEstimate | None, current: CurrentEstimate | None
     """Return Rsc, Csc and Ci of the circuit from the estimates of Vsc and I, or None if these do not determine them."""
     if current is None or not current.weight > 0.0:
         return None
+    # weight = 2 g^2 / Rsc and capacitance = g Csc, and thus:
+    Ci = current.capacitance + current.weight * current.b  # of which the weight, less well known, is a small part
     if vsc is not None and math.isfinite(vsc.b):
         g, b, _ = vsc
     elif vsc is None and current.capacitance > 0.0:
-        # weight = 2 g^2 / Rsc, capacitance = g Csc = b g (1 - 2 g) / Rsc
-        ratio = current.weight * current.b / current.capacitance
-        g, b = 0.5 * ratio / (1.0 + ratio), current.b
+        g, b = 0.5 * current.weight * current.b / Ci, current.b
     else:
         return None
-    Rsc = 2.0 * g * g / current.weight
-    return (Rsc, (1.0 - 2.0 * g) * b / Rsc, g * b / Rsc) if g < 0.5 else None
+    return (g * b / Ci, (1.0 / g - 2.0) * Ci, Ci) if g < 0.5 and Ci > 0.0 else None
 
 
 def prior_skin_moments(likelihood: Likelihood) -> tuple[np.ndarray, np.ndarray]:

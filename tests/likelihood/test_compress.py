@@ -192,6 +192,20 @@ def test_steps_give_the_delayed_response_of_a_short_time_constant(delay: float, 
         np.testing.assert_allclose(found / scale, expected / scale, atol=1e-6 if tau == 0.4 * step else 1e-9)
 
 
+def test_a_table_for_time_constants_far_below_a_late_step_stays_finite():
+    """The response 2 steps back from a sample grew by e^{2 / tau}, and an SVD of infinite numbers failed."""
+    rng, time = np.random.default_rng(12), 2e-6 * np.arange(2_000)
+    voltage, y, tau = np.cumsum(rng.standard_normal(time.size)), rng.standard_normal(time.size), 2e-5
+    voltage[:20] = voltage[-20:] = 0.0
+    terms, noise = HighpassTerms((1.0,), (tau,)), np.zeros(time.size)
+    how = {"steady_state": False, "expected_terms": terms, "noise": noise, "is_wide": True}
+    table = compress(fitact.Sampled(time, voltage), time, y, **how)
+    narrow = table.restrict(np.log([tau]), np.full(1, 9.0), 1e-7, charge=0.0, delay=(3e-6, 5e-6))
+    u = np.interp(time - 4e-6, time, unit_response(time, voltage, tau))
+    products = [each.response(terms, 4e-6) @ each.observed for each in (table, narrow)]
+    np.testing.assert_allclose(products, u @ y, rtol=0.0, atol=1e-7 * np.linalg.norm(u) * np.linalg.norm(y))
+
+
 def test_several_time_constants_far_apart():
     time = 2e-6 * np.arange(20_000)
     voltage = np.cumsum(np.random.default_rng(10).standard_normal(time.size))

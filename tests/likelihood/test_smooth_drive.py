@@ -6,7 +6,8 @@ import pytest
 import scipy.signal
 
 import fitact
-from fitact.likelihood.smooth_drive import lasting_bend, missing_curve, smooth_drive
+from fitact.data.tones import Tones
+from fitact.likelihood.smooth_drive import curve_drive, lasting_bend, missing_curve, smooth_drive
 
 STEP, FINE = 6.25e-6, 8  # s, and fine steps of the truth in a step
 SKIN = np.array([160e3, 24e-9, 1.35e-9])
@@ -39,6 +40,23 @@ def test_compiled_and_without():
     with jax.enable_x64(True):
         compiled = jax.jit(smooth_drive)(V, np.array([[1.0], [0.5]]))
     np.testing.assert_allclose(compiled, smooth_drive(V, np.array([[1.0], [0.5]])), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("knows_tones", [False, True])
+@pytest.mark.parametrize("late", [0.0, 0.3])
+@pytest.mark.parametrize("lag", [0.1, 0.4])
+def test_a_low_pass_reads_curves_between_samples(lag: float, late: float, knows_tones: bool):
+    """A late sine of 20 samples a period through a low-pass, by its gain, and the lines between samples by SciPy."""
+    k, omega, fine = np.arange(400.0), 2.0 * np.pi / 20.0, 40
+    sine, steps = np.sin(omega * k), np.arange(0.0, 399.0, 1.0 / fine)
+    curved = curve_drive(sine, late, Tones.from_samples(sine, np.array([omega])) if knows_tones else None, lag)
+
+    def error(drive: np.ndarray) -> float:
+        lines = scipy.signal.lsim(([1.0], [lag, 1.0]), np.interp(steps, k, drive), steps, X0=[0.0])[1]
+        found = np.interp(k[100:300] - late, steps, lines)
+        return float(np.max(np.abs(found - (np.exp(1j * omega * (k[100:300] - late)) / (1.0 + 1j * omega * lag)).imag)))
+
+    assert error(curved) < 0.12 * error(sine)
 
 
 def record(

@@ -212,6 +212,39 @@ def test_edges_that_set_the_range_of_I_leave_its_plateaus_to_few_steps():
     assert both.parameters()["Rsc"]["u"] < 0.05
 
 
+@pytest.mark.parametrize(
+    ("drive", "rate"),
+    [
+        pytest.param({"waveform": "sine", "peak_to_peak": 300.0, "frequency": 200.0}, 200e3, id="sine"),
+        pytest.param(
+            {"waveform": "multitone", "frequencies": [9950.0, 10e3, 10050.0], "amplitudes": [37.0, 75.0, 37.0]},
+            100e3,
+            id="carrier",
+        ),
+        pytest.param(
+            {"waveform": "trapezoid", "peak_to_peak": 200.0, "frequency": 80.0, "rise_time": 200e-6}, 100e3, id="edges"
+        ),
+    ],
+)
+def test_vsc_and_a_current_through_a_resistance(drive: dict[str, object], rate: float):
+    """A sine ended 41 u away, with a start 40 times too large; at 10 kHz, 2 kohm weaken I by 0.4 %, 15 u."""
+    record = simulate_bench(drive, 14, rate, {"V": 0.1, "Vsc": 2e-3, "I": 40e-9}, 2000.0, late=0.3)
+    content = bench_scene(["Vsc", "I"]).model_dump(exclude_unset=True)
+    found = fitact.fit(record, fitact.Scene.from_dict({**content, "grounding": {"R_H": 2000.0}}))
+    assert found.trusted
+    assert np.max(np.abs(errors(found))) < 4.0
+    assert found.parameters()["Ci"]["u"] < 1e-3
+
+
+@pytest.mark.parametrize(("lag", "omega"), [(0.2, 0.6), (0.33, 0.6), (0.33, 0.2)])
+def test_what_a_lag_weakens(lag: float, omega: float):
+    """The rise of a sine behind a low-pass, by its gain."""
+    V = 100.0 * np.sin(omega * np.arange(2000.0))
+    current = RecordedCurrent.from_record(fitact.Record.from_arrays(1e-5 * np.arange(V.size), V=V, I=1e-6 * V))
+    ratio = np.std(current.rise(V, lag)[200:-200]) / np.std(current.rise(V)[200:-200])
+    assert ratio == pytest.approx(1.0 / math.hypot(1.0, omega * lag), abs=0.03 * (omega * lag) ** 2)
+
+
 @pytest.mark.parametrize("R_H", [500.0, 2000.0])
 def test_a_resistance_that_limits_the_current_for_part_of_a_step(R_H: float):
     """0.07 and 0.27 steps. As kinks between samples, the edges of I moved Ci by 5 to 9 standard errors: a misfit."""
