@@ -214,8 +214,7 @@ def experiment_from_scene(scene: Scene) -> Experiment:
 
 def _stray_sd(scene: Scene) -> float:
     """Return the standard deviation of log(stray capacitance) in I, if its distribution is stated; else 0."""
-    measured = scene.measurement.model_copy(update={"channels": ("I",)})
-    prior = scene.model_copy(update={"measurement": measured}).make_prior()
+    prior = scene.with_channels("I").make_prior()
     return float(prior[STRAY].log_sd) if STRAY in prior.names else 0.0
 
 

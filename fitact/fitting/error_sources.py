@@ -15,7 +15,6 @@ from fitact.likelihood.likelihood import Likelihood
 from fitact.model.skin import probe_parameters
 from fitact.prior.distributions import LogNormal, Uniform
 from fitact.problem.instrument_errors import UNRESOLVED_V, ErrorCoordinate, InstrumentError
-from fitact.scene.assumptions import states_Ci
 from fitact.scene.scene import Scene
 from fitact.uncertainty.budget import Component
 from fitact.uncertainty.effect_size import EffectSizes
@@ -54,7 +53,7 @@ def list_error_sources(
         label, remedy = f"prior of {name}", _MEASURE.get(name, "state a narrower prior, if you know more")
         if load is not None and name in loads:
             label = f"input {name.removeprefix('probe_')} ({load.name})"
-        origin = "default Ci" if name == "Ci" and not states_Ci(scene) else ""
+        origin = "default Ci" if name == "Ci" and not scene.states_Ci else ""
         component = Component.from_prior(label, likelihood.prior[name], remedy, is_shared=name in loads, origin=origin)
         sources.append((component,))
     return tuple(sources)

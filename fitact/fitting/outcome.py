@@ -26,8 +26,8 @@ RESULTS = {
         "The fit has several optima that are almost equally good; state a narrower prior, or sample the posterior."
     ),
     "misfit": (
-        "Poor fit: the residuals are larger than the noise or correlated. Inspect them in the report, then fit with"
-        " the measured drive or add the missing circuit element (a gap, R_H, …) to the scene."
+        "Poor fit: the residuals are larger than the noise or correlated. Inspect them in the report, then add the"
+        " missing circuit element (a gap, R_H, …) to the scene or, if it names a waveform, fit with the measured drive."
     ),
     "structure": "The residuals are more than noise, but can hardly move the results.",
     "nonfinite": "The search met values that are not finite; check the record, or state a narrower prior.",

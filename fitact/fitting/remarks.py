@@ -22,7 +22,6 @@ from fitact.model.skin import constant_skin_circuit
 from fitact.problem.drive_choice import DriveModel
 from fitact.problem.source import Source
 from fitact.problem.starting_point import CurrentEstimate, skin_from_estimates
-from fitact.scene.assumptions import states_Ci
 from fitact.scene.scene import Scene
 from fitact.units import format_engineering, format_percent, quantity_unit
 
@@ -218,10 +217,12 @@ def stray_note(changes: Mapping[str, float]) -> str:
 
 def describe_assumed_Ci(scene: Scene | None, likelihood: Likelihood, prior_sets_Ci: bool) -> Remarks:
     """Describe a Ci that nobody stated: in a warning if its prior sets results, otherwise in a note."""
-    if (scene is not None and states_Ci(scene)) or not likelihood.use_prior or "Ci" not in likelihood.names:
+    if (scene is not None and scene.states_Ci) or not likelihood.use_prior or "Ci" not in likelihood.names:
         return Remarks()
     prior = likelihood.prior["Ci"]
-    value = f"{format_engineering(math.exp(prior.log_mean), 'F')} ± {format_percent(float(prior.log_sd))}"
+    factor = math.exp(1.96 * float(prior.log_sd))
+    spread = f"± {format_percent(float(prior.log_sd))}" if factor < 2.0 else f"within a factor of {factor:.2g}"
+    value = f"{format_engineering(math.exp(prior.log_mean), 'F')} {spread}"
     subject = "no scene was given" if scene is None else "the scene does not state Ci"
     assumed = f"{subject}, so the insulator of the reference paper is assumed (Ci = {value})"
     if not prior_sets_Ci:

@@ -112,10 +112,9 @@ def build_problem(
 
     Spectra follow the records. `drives` holds the drives of the first records, if they are already chosen.
     """
-    first = scenes[0] or Scene()
-    prior = first.make_prior()
+    first, in_time = scenes[0] or Scene(), [each for each in records if isinstance(each, Record)]
+    prior = first.with_channels(*_channels(in_time[0], scenes[0])).make_prior() if in_time else first.make_prior()
     noise: dict[str, Distribution] = {name: prior[name] for name in NOISE_PRIORS if name in prior.names}
-    in_time = [each for each in records if isinstance(each, Record)]
 
     def make_circuit(values: dict[str, float]) -> Circuit:
         if not in_time:

@@ -95,9 +95,10 @@ def estimate_recorded(
     return estimate, nuisances
 
 
-def _lacks_capacitance(estimate: CurrentEstimate, belief: Belief, least: float = 0.3) -> bool:
-    """Return whether Ci is below `least` of its prior median: noise of V draws an undetermined one to 0."""
-    return estimate.capacitance + estimate.weight * estimate.b < least * math.exp(belief[0][2])
+def _lacks_capacitance(estimate: CurrentEstimate, belief: Belief, least: float = 0.3, sds: float = 2.0) -> bool:
+    """Return whether Ci is below `least` of its prior median, and by `sds`: noise of V draws it to 0."""
+    mean, sd = (each[2] for each in belief)
+    return estimate.capacitance + estimate.weight * estimate.b < min(least, math.exp(-sds * sd)) * math.exp(mean)
 
 
 def _scan_recorded(

@@ -74,13 +74,6 @@ def _prior_assumptions(scene: Scene) -> tuple[Assumption, ...]:
         and bool({"factor", "relative_sd", "low", "tolerance"} & scene.prior.Ci.model_fields_set)
     )
     return (
-        Assumption("Ci", key, median, "F", format_engineering(median, "F"), states_Ci(scene), "prior"),
+        Assumption("Ci", key, median, "F", format_engineering(median, "F"), scene.states_Ci, "prior"),
         Assumption("relative sd of Ci", key, log_sd, "", format_percent(log_sd), own_spread, "prior"),
     )
-
-
-def states_Ci(scene: Scene) -> bool:
-    """Return whether a scene states Ci: by a value, by area, thickness and permittivity, or by a prior of its own."""
-    device, spec = scene.device.model_fields_set, scene.prior.Ci
-    own_prior = bool({"median", "low", "nominal", "tied"} & spec.model_fields_set) or isinstance(spec.fixed, float)
-    return own_prior or "Ci" in device or {"insulator_thickness", "insulator_permittivity", "contact_area"} <= device

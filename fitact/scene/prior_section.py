@@ -23,6 +23,7 @@ from fitact.scene.section import Section
 
 # of the friction, if it is measured and nothing is stated
 FRICTION_PRIORS = {"mu": PriorSpec(factor=10.0), "force_scale": PriorSpec(factor=1e4)}
+UNKNOWN_CI = PriorSpec(factor=20.0)  # where I is fitted, which determines Ci, and nothing is stated
 _SKIN_PARAMETERS = ("Rsc", "Csc", "grounding_Rsc", "grounding_Csc")  # parameters in the published tables
 
 
@@ -30,7 +31,8 @@ class PriorSection(Section):
     """Prior specifications; the default median is the scene's value, and an absent parameter is not free.
 
     The 95 % intervals of the default skin priors extend from the values of the reference paper to published values of
-    whole skin (10 kohm and 5 nF dry, 4.3 kohm and 200 nF wet). The default of the insulator, ± 5 %, is an assumption.
+    whole skin (10 kohm and 5 nF dry, 4.3 kohm and 200 nF wet). The default of the insulator, ± 5 %, is an assumption;
+    where the current is fitted, which determines it, 95 % lie within a factor of 20.
     With the channel Ft, mu and force_scale are free within factors of 10 and 10,000 unless specified.
     Noise standard deviations (`sigma` of Vsc, `sigma_I` of I, `sigma_Ft` of Ft) have priors flat in their logarithm
     unless specified.

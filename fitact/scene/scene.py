@@ -21,7 +21,7 @@ from pydantic import model_validator
 from fitact.charts.circuit_diagram import Lead, lay_out_circuit, lay_out_wiring
 from fitact.errors import InputError
 from fitact.instrument.pieces import Piece, find_load
-from fitact.model.circuit import RC, Circuit, DirectGround, FinalCircuit, NaturalGround, Probe
+from fitact.model.circuit import RC, Channel, Circuit, DirectGround, FinalCircuit, NaturalGround, Probe
 from fitact.model.drive import Drive
 from fitact.model.force import EPSILON_0, Geometry, plate_capacitance
 from fitact.model.skin import Dispersive, Fractional, WithSkin
@@ -31,7 +31,7 @@ from fitact.prior.product import multiply
 from fitact.prior.published import Layer
 from fitact.scene import diagrams, sections, toml
 from fitact.scene.instrument_section import CalibrationSection, InstrumentSection
-from fitact.scene.prior_section import FRICTION_PRIORS, PriorSection
+from fitact.scene.prior_section import FRICTION_PRIORS, UNKNOWN_CI, PriorSection
 from fitact.scene.prior_spec import ORDER_KEYS, PriorSpec
 from fitact.scene.section import Section, field_section
 from fitact.scene.threshold_table import resolve_table_path
@@ -385,12 +385,27 @@ class Scene(Section, Display):
         """Make the drive; refused if the waveform is 'measured', which only a record has."""
         return self.drive.make()
 
+    def with_channels(self, *channels: Channel) -> Self:
+        """Return the scene in which these channels are fitted."""
+        return self.model_copy(update={"measurement": self.measurement.model_copy(update={"channels": channels})})
+
+    @property
+    def states_Ci(self) -> bool:
+        """Whether the scene states Ci: by a value, by area, thickness and permittivity, or by a prior of its own."""
+        device, spec = self.device.model_fields_set, self.prior.Ci
+        own_prior = bool({"median", "low", "nominal", "tied"} & spec.model_fields_set) or isinstance(spec.fixed, float)
+        return (
+            own_prior or "Ci" in device or {"insulator_thickness", "insulator_permittivity", "contact_area"} <= device
+        )
+
     def make_prior(self) -> Prior:
         """Make the prior of the free parameters, without gains."""
         layer = Layer(self.device.contact_area, self.skin.thickness, self.drive.lowest_frequency)
         default = FRICTION_PRIORS if "Ft" in self.measurement.channels else {}
-        nominal, beliefs = self.nominal_values(), (default | self.prior.specs()).items()
-        marginals = {name: b.distribution(name, nominal[name], layer) for name, b in beliefs if b.is_free}
+        nominal, beliefs = self.nominal_values(), default | self.prior.specs()
+        if "I" in self.measurement.channels and not self.states_Ci and "Ci" not in self.prior.model_fields_set:
+            beliefs["Ci"] = UNKNOWN_CI
+        marginals = {name: b.distribution(name, nominal[name], layer) for name, b in beliefs.items() if b.is_free}
         stray = self.measurement.stray_capacitance
         if isinstance(stray, UncertainValue) and "stray_capacitance" not in self._unmeasured_parameters():
             marginals.setdefault("stray_capacitance", stray.distribution())

@@ -236,6 +236,18 @@ def test_vsc_and_a_current_through_a_resistance(drive: dict[str, object], rate: 
     assert found.parameters()["Ci"]["u"] < 1e-3
 
 
+@pytest.mark.parametrize("given", [None, scene(["I"])], ids=["no scene", "no Ci"])
+def test_a_current_tells_a_Ci_that_nobody_stated(given: fitact.Scene | None):
+    """Half of the reference paper's, which was assumed to 5 %, so that the answer was 40 u away."""
+    drive = {"waveform": "triangle", "peak_to_peak": 300.0, "frequency": 200.0}
+    record = simulate_bench(drive, 12, 100e3, {"V": 0.3, "Vsc": 0.01, "I": 200e-9}, late=0.3)
+    found = fitact.fit(fitact.Record.from_arrays(record.time, V=record["V"], I=record["I"], source="bench"), given)
+    assert found.trusted
+    assert np.max(np.abs(errors(found))) < 4.0
+    assert found.parameters()["Ci"]["u"] < 0.02
+    assert any("Ci = 1.35 nF within a factor of 20" in note for note in found.notes)
+
+
 @pytest.mark.parametrize(("lag", "omega"), [(0.2, 0.6), (0.33, 0.6), (0.33, 0.2)])
 def test_what_a_lag_weakens(lag: float, omega: float):
     """The rise of a sine behind a low-pass, by its gain."""
