@@ -1,7 +1,6 @@
 """Rows of charge at the optimum of a fit: with its circuit, nuisances and delay, and the drive estimated there."""
 
 import dataclasses
-import functools
 import math
 from collections.abc import Sequence
 
@@ -117,15 +116,16 @@ def _rows_at(
 
     modelled = Current.from_channel(channel, inputs, delay)
 
-    def respond_with_nuisances(V: Rows) -> tuple[np.ndarray, np.ndarray]:
-        return _modelled_rows(_with_drive(full, current, V, modelled.lag), inputs, sizes)
+    def respond_with_nuisances(V: Rows) -> tuple[Rows, Rows]:
+        rows, nuisances = _modelled_rows(_with_drive(full, current, V, modelled.lag), inputs, sizes)
+        return np.asarray(rows)[:size], np.asarray(nuisances)[:size]
 
-    respond_to_V = functools.cache(lambda: respond_with_nuisances(current.V))
+    from_V, nuisances = respond_with_nuisances(current.V)
 
     def respond(V: Rows) -> Rows:
-        return np.asarray((respond_to_V() if V is current.V else respond_with_nuisances(V))[0])[:size]
+        return from_V if V is current.V else respond_with_nuisances(V)[0]
 
-    return *current.make_rows(modelled, respond, np.asarray(respond_to_V()[1])[:size]), delay * current.step
+    return *current.make_rows(modelled, respond, nuisances), delay * current.step
 
 
 def _with_drive(channel: ChannelLikelihood, current: RecordedCurrent, V: Rows, lag: float) -> ChannelLikelihood:

@@ -98,7 +98,7 @@ def estimate_recorded(
 def _lacks_capacitance(estimate: CurrentEstimate, belief: Belief, least: float = 0.3, sds: float = 2.0) -> bool:
     """Return whether Ci is below `least` of its prior median, and by `sds`: noise of V draws it to 0."""
     mean, sd = (each[2] for each in belief)
-    return estimate.capacitance + estimate.weight * estimate.b < min(least, math.exp(-sds * sd)) * math.exp(mean)
+    return estimate.Ci < min(least, math.exp(-sds * sd)) * math.exp(mean)
 
 
 def _scan_recorded(

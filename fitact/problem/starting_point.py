@@ -32,6 +32,11 @@ class CurrentEstimate(NamedTuple):
     b: float  # s
     capacitance: float  # F
 
+    @property
+    def Ci(self) -> float:
+        """Capacitance at low frequencies, that of the insulator; the weight, less well known, is a small part, F."""
+        return self.capacitance + self.weight * self.b
+
 
 class SkinEstimate(NamedTuple):
     """Rsc (ohm), Csc and Ci (F) from linear fits."""
@@ -129,8 +134,7 @@ def skin_from_estimates(vsc: VscEstimate | None, current: CurrentEstimate | None
     """Return Rsc, Csc and Ci of the circuit from the estimates of Vsc and I, or None if these do not determine them."""
     if current is None or not current.weight > 0.0:
         return None
-    # weight = 2 g^2 / Rsc and capacitance = g Csc, and thus:
-    Ci = current.capacitance + current.weight * current.b  # of which the weight, less well known, is a small part
+    Ci = current.Ci  # weight = 2 g^2 / Rsc, capacitance = g Csc
     if vsc is not None and math.isfinite(vsc.b):
         g, b, _ = vsc
     elif vsc is None and current.capacitance > 0.0:
