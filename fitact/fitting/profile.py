@@ -27,7 +27,8 @@ from fitact.summary import format_range
 from fitact.tables import align_table, join_lines
 from fitact.units import format_engineering, quantity_unit
 
-PROFILE_QUANTITIES = ("g", "b", "force_mean")
+DIVIDER = ("g", "b")
+PROFILE_QUANTITIES = (*DIVIDER, "force_mean")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,18 +53,18 @@ class Interval:
 
 
 class ConstrainedFit(eqx.Module):
-    """Fit with a constrained quantity: an element of theta, or the logarithm of one of `PROFILE_QUANTITIES`."""
+    """Fit with a constrained quantity: an element of theta, or the logarithm of g, b or the mean force."""
 
     likelihood: Likelihood  # likelihood with or without the prior of the circuit
     sigma: Float[Array, " channels"]  # noise sd of the channels, fixed
-    derive: DerivedQuantities | None  # None means that the quantities are theta
+    derive: DerivedQuantities | None  # of the mean force; without it, the quantities are theta and those of `DIVIDER`
 
     def quantities(self, theta: Float[Array, " parameters"]) -> Float[Array, " quantities"]:
         """Return the values of the quantities at theta."""
-        if self.derive is None:
-            return theta
-        values = self.derive(theta, self.sigma)
-        return jnp.log(jnp.stack([values[DERIVED_NAMES.index(name)] for name in PROFILE_QUANTITIES]))
+        if self.derive is not None:
+            return jnp.log(self.derive(theta, self.sigma)[DERIVED_NAMES.index("force_mean")])[None]
+        finger = self.likelihood.finger(self.likelihood.circuit(theta))
+        return jnp.concatenate([theta, jnp.log(jnp.stack([finger.g, finger.b]))])
 
 
 @jit
@@ -93,17 +94,18 @@ def profile_intervals(laplace: Laplace, names: Sequence[str], level: float, prio
     for name in names:
         if name not in (available := (*likelihood.names, *PROFILE_QUANTITIES)):
             raise InputError(f"no interval is available for {name}; choose from {', '.join(available)}")
-    derived_sd = laplace.derived_log_sd[[DERIVED_NAMES.index(name) for name in PROFILE_QUANTITIES]]
     intervals = {}
     with double_precision():
         likelihood = dataclasses.replace(likelihood.without_samples(), use_prior=prior and likelihood.use_prior)
-        sd = np.linalg.norm(laplace.covariance_root, axis=1)
-        for kind, errors, derive in ((likelihood.names, sd, None), (PROFILE_QUANTITIES, derived_sd, laplace.derive)):
+        sd = dict(zip(likelihood.names, np.linalg.norm(laplace.covariance_root, axis=1), strict=True))
+        sd |= zip(DERIVED_NAMES, laplace.derived_log_sd, strict=True)
+        for kind, derive in (((*likelihood.names, *DIVIDER), None), (("force_mean",), laplace.derive)):
             chosen = [name for name in names if name in kind]
             if not chosen:
                 continue
             model = ConstrainedFit(likelihood, jnp.asarray(laplace.sigmas), derive)
-            sides = interval_bounds(model, laplace.theta, errors, [kind.index(name) for name in chosen], level)
+            indices, errors = [kind.index(name) for name in chosen], np.array([sd[name] for name in chosen])
+            sides = interval_bounds(model, laplace.theta, errors, indices, level)
             for name, side in zip(chosen, sides, strict=True):
                 low, high = timing[name][0] + side * timing[name][1] if name in timing else np.exp(side)
                 intervals[name] = Interval(float(low), float(high), level, likelihood.use_prior)
@@ -113,11 +115,12 @@ def profile_intervals(laplace: Laplace, names: Sequence[str], level: float, prio
 def compare_with_normal(laplace: Laplace, name: str, z: float) -> tuple[float, float]:
     """Return as how many standard deviations `z` of them count, below and above the optimum.
 
-    These are roots of the deviance of the profile of one of `PROFILE_QUANTITIES`: `z` if its posterior is normal.
+    These are roots of the deviance of the profile of g or b: `z` if its posterior is normal.
     """
-    index, sd = PROFILE_QUANTITIES.index(name), laplace.derived_log_sd[DERIVED_NAMES.index(name)]
+    index = len(laplace.likelihood.names) + DIVIDER.index(name)
+    sd = laplace.derived_log_sd[DERIVED_NAMES.index(name)]
     with double_precision():
-        model = ConstrainedFit(laplace.likelihood.without_samples(), jnp.asarray(laplace.sigmas), laplace.derive)
+        model = ConstrainedFit(laplace.likelihood.without_samples(), jnp.asarray(laplace.sigmas), None)
         side, rows = np.array([0.0, -1.0, 1.0]), np.full(3, index)  # the first is the optimum, without a pseudo-datum
         center = float(laplace.log_derived[0][DERIVED_NAMES.index(name)])
         goal, weight, points = center + z * sd * side, 20.0 / sd * np.abs(side), np.tile(laplace.theta, (3, 1))
@@ -130,20 +133,20 @@ def compare_with_normal(laplace: Laplace, name: str, z: float) -> tuple[float, f
 def interval_bounds(
     model: ConstrainedFit,
     theta: Float[np.ndarray, " parameters"],
-    sd: Float[np.ndarray, " quantities"],
+    sd: Float[np.ndarray, " indices"],
     indices: Sequence[int],
     level: float,
-) -> Float[np.ndarray, "quantities 2"]:
+) -> Float[np.ndarray, "indices 2"]:
     """Return the bounds of the intervals of the quantities `indices`; an open bound is not finite.
 
     All bounds are searched in parallel, each between the last value that was too near and the last that was too far.
-    `sd` holds the expected standard errors.
+    `sd` holds the expected standard error of each.
     """
     pseudo_datum_sd = 0.05  # relative to these
     root_tolerance, max_rounds = 1e-4, 30  # relative, of the square root of the deviance
     z = NormalDist().inv_cdf(0.5 * (1.0 + level))
     rows, side = np.repeat(np.asarray(indices), 2), np.tile([-1.0, 1.0], len(indices))
-    expected = np.minimum(sd[rows], UNCONSTRAINED_SD / z)
+    expected = np.minimum(np.repeat(sd, 2), UNCONSTRAINED_SD / z)
     weight = 1.0 / (pseudo_datum_sd * expected)
     points, zeros = np.tile(theta, (rows.size, 1)), np.zeros(rows.size)
     points, optimum, minimum = map(np.asarray, _fit_constrained(model, rows, zeros, 0.0 * weight, points))
