@@ -128,7 +128,7 @@ class RecordedDriveProblem(BatchProblem):
             shared=shared,
             linear_sd=linear_sd,
             gain_sd=log_sd(fitted.scene.measurement.gain_relative_sd),
-            unresolved=has_unresolved_edge(choice.voltage),
+            unresolved=has_unresolved_edge(record),
             evaluated=slice(begin, begin + np.trim_zeros(np.asarray(fitted.derive.weight), "b").size),
             repeat=None if frequency is None else round(max(1, math.floor(2.0 / 3.0 * time.size / period)) * period),
         )

@@ -124,12 +124,15 @@ class Record(Display):
     def noise_parts(self, channel: str) -> tuple[float, float]:
         """Return the sd of white noise, and that of rounding (see `noise`)."""
         if ("noise", channel) not in self._estimates:
-            values = self[channel] if channel == "V" else self[channel][~clipping_mask(self[channel])]
-            if channel == "V" and self.tones is not None:
-                rounding = self.tones.rounding
-                white = math.sqrt(max(float(np.var(values - self.tones.values())) - rounding**2, 0.0))
-            else:
-                white, rounding = white_noise_sd(values), rounding_noise_sd(values)
+            values = self[channel]
+            valid = np.ones(values.size, bool) if channel == "V" else ~clipping_mask(values)
+            rounding, tones = rounding_noise_sd(values[valid]), self.tones if "V" in self else None
+            if tones is None:
+                white = white_noise_sd(values[valid])
+            else:  # fast ones would be taken for noise
+                rest = values - tones.from_samples(values, tones.frequencies, rounds=1).values()
+                beside = math.sqrt(max(float(np.var(rest)) - rounding**2, 0.0))
+                white = beside if channel == "V" else white_noise_sd(rest[valid])
             self._estimates["noise", channel] = white, rounding
         return self._estimates["noise", channel]
 

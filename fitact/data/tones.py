@@ -58,9 +58,8 @@ class Tones(NamedTuple):
 
     @property
     def carrier(self) -> float | None:
-        """Frequency of the strongest tone (rad per sample), if a delay changes its phase more than a finger does."""
-        frequency = float(self.frequencies[self._strongest])
-        return frequency if frequency > 0.1 else None
+        """Frequency of the strongest tone (rad per sample), if a delay changes the phases more than a finger does."""
+        return float(self.frequencies[self._strongest]) if np.min(self.frequencies) > 0.1 else None
 
     def carrier_gain(self, values: Samples) -> complex:
         """Return the gain of other samples over the strongest tone."""
@@ -71,11 +70,9 @@ class Tones(NamedTuple):
         """Return the signal at the samples."""
         return self._sum(self.phasors)
 
-    def values_for_lines(self, late: float) -> Samples:
-        """Return samples between which lines are the signal, where it is read `late` (in samples)."""
-        part = late % 1.0
-        back = np.exp(-1j * self.frequencies)
-        return self._sum(self.phasors * back**part / (1.0 - part + part * back))
+    def scale(self, factors: Complex[np.ndarray, " tones"]) -> Samples:
+        """Return the tones without the mean, each times a factor, at the samples."""
+        return self._sum(self.phasors * factors) - self.mean
 
     def basis(self) -> Float[np.ndarray, "functions samples"]:
         """Return orthonormal functions of which the signal consists."""
@@ -103,6 +100,7 @@ def find_tones(
     frequency: float,
     rounding: float = 0.0,
     max_tones: int = 8,
+    max_multisine: int = 64,
     cycles: float = 8.0,
     max_distortion: float = 0.03,
 ) -> Tones | None:
@@ -110,15 +108,20 @@ def find_tones(
 
     `frequency` is that with which it repeats (cycles per sample), or infinite; `rounding` is the sd of its rounding
     errors. Below a number of `cycles`, a spectrum does not tell a tone from the mean. It hides tones up to
-    `max_distortion` of the others, which are added; an edge has many.
+    `max_distortion` of the others, which are added; an edge has many. A multisine has up to `max_multisine` tones of
+    similar height, and hardly any lower ones.
     """
     size = some = min(values.size, _SOME)
     found, height = _find_lines(values[:some] - values[:some].mean())
     if not found.size and frequency * some < cycles:
-        found, height = np.array([2.0 * np.pi * frequency]), np.ones(1)
-    if np.count_nonzero(height > 1e-3) > max_tones:
+        found, height = _find_harmonics(values[:some], frequency, max_multisine)
+    lines, found = np.count_nonzero(height > 1e-3), found[height > max_distortion]
+    if found.size > max_tones:
+        max_tones = min(found.size + max_tones, max_multisine)
+        if np.min(found) > 3.0 * np.pi * frequency:  # the slowest tone may be hidden by the mean
+            found = np.append(2.0 * np.pi * frequency, found)
+    if lines > max_tones:
         return None
-    found = found[height > max_distortion]
     while 0 < found.size <= max_tones:
         tones = Tones.from_samples(values[:size], found, rounding)
         found, rest = tones.frequencies, values[:size] - tones.values()
@@ -136,6 +139,20 @@ def find_tones(
         else:
             size = min(4 * size, values.size)
     return None
+
+
+def _find_harmonics(
+    values: Samples, frequency: float, most: int
+) -> tuple[Float[np.ndarray, " lines"], Float[np.ndarray, " lines"]]:
+    """Return the frequencies (rad per sample) and heights of the harmonics of a `frequency`, relative to the largest.
+
+    They are above the noise, and there are `most` at most.
+    """
+    harmonics = 2.0 * np.pi * frequency * np.arange(1.0, 1.0 + max(1, min(most, int(0.45 / frequency))))
+    tones = Tones.from_samples(values, harmonics, rounds=1)
+    size, floor = np.abs(tones.phasors), 6.0 * float(np.std(values - tones.values())) * np.sqrt(2.0 / values.size)
+    seen = size >= min(floor, float(size.max()))
+    return harmonics[seen], size[seen] / size.max()
 
 
 def _is_noise(rest: Samples, rounding: float, block: int = 32) -> bool:

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from fitact.compiled import jit, pad_samples
 from fitact.data.record import Record
+from fitact.data.tones import Tones
 from fitact.fitting.channel_fit import sample_residuals
 from fitact.fitting.least_squares import LeastSquaresResult
 from fitact.fitting.timing import free_timing
@@ -17,6 +18,7 @@ from fitact.likelihood.charge_rows import MAX_STEPS, ChargeRows
 from fitact.likelihood.compression import HUM_FREQUENCIES
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.observable import ChannelInputs
+from fitact.model.circuit import HighpassTerms, gain_at
 from fitact.model.drive import Sampled
 from fitact.problem.limited_current import NoisePath, estimate_drive, replace_drive, set_drive
 from fitact.problem.recorded_current import Current, RecordedCurrent, set_rows
@@ -81,9 +83,27 @@ def _update_drive(
     noise = respond(current.V, whole) - respond(current.smooth, whole)
     noise += stray * np.roll(rise, steps)
     path = NoisePath.from_terms(circuit.terms[channel.channel], stray, step)
+    known = respond(current.smooth, late)
+    if current.tones is not None:  # whose residuals tell nothing of the drive, and would draw a delay along
+        terms = circuit.terms[channel.channel]
+        terms = terms._replace(rate=(terms.rate or 0.0) + stray)
+        noise += _missing_response(current.tones, terms, float(shift + inputs.delay), known, record)
+        return replace_drive(set_drive(full, path, record, current.smooth, noise), record, current.smooth, noise)
     full = set_drive(full, path, record, current.smooth, noise)
     V = estimate_drive(full, path, sample_residuals(full, inputs, sigma)[1], record)
-    return replace_drive(full, record, V, noise + respond(current.smooth, late) - respond(V, late))
+    return replace_drive(full, record, V, noise + known - respond(V, late))
+
+
+def _missing_response(tones: Tones, terms: HighpassTerms, delay: float, known: Rows, record: Record) -> Rows:
+    """Return what the response to the tones of a drive has beside that to lines between its samples, which is `known`.
+
+    The latter begins at rest, and its decays are left out. The response is `delay` (s) late.
+    """
+    omega = tones.frequencies / record.time_step
+    missing = tones.scale(jit(gain_at)(terms, omega) * np.exp(-1j * omega * delay)) - known
+    since = record.time - record.time[0]
+    decays = np.array([np.ones_like(since), *(np.exp(-since / float(tau)) for tau in terms.tau)]).T
+    return missing - decays @ np.linalg.lstsq(decays, missing)[0]
 
 
 def _expect_harmonics(channel: ChannelLikelihood, fitted: Float[np.ndarray, " columns"]) -> np.ndarray:

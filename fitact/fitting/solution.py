@@ -1,5 +1,6 @@
 """Optimum of a problem: fits with compression, until effects of instruments and weights of spectra no longer change."""
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -44,7 +45,7 @@ def solve_problem(
     """
     first = problem
     noise, theta = [source.noise for source in problem.sources], choose_start(problem, start)
-    likelihood, best, steps = problem.likelihood, None, 0
+    likelihood, best, best_rank, steps = problem.likelihood, None, (False, -math.inf), 0
     likelihood = estimate_drives(likelihood, theta, problem.sources)
     full: dict[int, str] = {}  # channels whose table has failed, and why
     has_rows = any(channel.samples.has_drive_noise for channel in likelihood.channels)
@@ -52,7 +53,7 @@ def solve_problem(
         before, likelihood = theta, fill_effects(likelihood, theta, noise, problem.sources)
         problem = problem._replace(likelihood=likelihood)
         likelihood, reasons = problem.compress_likelihood(tolerance, full)  # what does not change stays compressed
-        likelihood = start_delays(likelihood, theta) if round_number == 0 else likelihood
+        likelihood = start_delays(likelihood, theta, problem.sources) if round_number == 0 else likelihood
         problem = problem._replace(likelihood=likelihood)
         solved = _solve(problem, tolerance, full, theta)
         if max_restarts and solved.result != "successful" and _largest_delay(solved) > max_late:
@@ -61,8 +62,11 @@ def solve_problem(
             return solve_problem(again, tolerance, None, max_restarts=max_restarts - 1)
         root, places = solved.covariance_factor(), _find_places(solved, likelihood)
         theta, steps = solved.theta[places], steps + solved.steps
-        if best is None or not has_rows or solved.log_density > best[2].log_density:
-            best = problem, reasons, solved
+        skew = np.max(np.abs(theta), where=likelihood.follows_rows, initial=0.0)
+        # rows hold beside their delay only
+        rank = bool(skew <= 2.0 * max_skew), solved.log_density
+        if not has_rows or rank > best_rank:
+            best, best_rank = (problem, reasons, solved), rank
         is_settled = effects_would_change(likelihood, before, theta, solved.sigma) <= max_change
         if is_settled:
             influences = [jacobian @ root for jacobian in solved.jacobian]
@@ -74,7 +78,6 @@ def solve_problem(
         is_settled, likelihood = is_settled and curved is likelihood, curved
         if has_rows:
             moved = np.abs(theta - before) / sd
-            skew = np.max(np.abs(theta), where=likelihood.follows_rows, initial=0.0)
             others = np.max(moved, where=~likelihood.follows_rows, initial=0.0)
             is_still = (skew <= max_skew and np.max(moved) <= max_change) or (skew <= 0.5 and others <= 0.05)
             is_settled = is_settled and round_number > 0 and is_still
@@ -89,8 +92,7 @@ def solve_problem(
             theta = np.where(likelihood.follows_rows, 0.0, theta)  # their delays have moved into the rows
         if steps > max_steps:
             break
-    assert best is not None
-    problem, reasons, solved = best
+    problem, reasons, solved = best or (problem, reasons, solved)
     root = solved.covariance_factor()
     certified, failed = _certify(solved, root, reasons, tolerance)
     while failed:

@@ -16,7 +16,7 @@ from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import student_weight
 from fitact.likelihood.observable import TIMING_NUISANCES, ChannelInputs
-from fitact.likelihood.smooth_drive import curve_drive
+from fitact.likelihood.smooth_drive import curve_drive, curve_tones
 from fitact.model.drive import Sampled
 from fitact.model.response import highpass
 from fitact.model.skin import constant_skin_circuit, limits_current
@@ -74,15 +74,15 @@ def free_timing(
     return channel.exclude_samples(edges).replace_timing(sd=timing_sd)
 
 
-def start_delays(likelihood: Likelihood, theta: Float[np.ndarray, " parameters"]) -> Likelihood:
+def start_delays(
+    likelihood: Likelihood, theta: Float[np.ndarray, " parameters"], sources: Sequence[Source]
+) -> Likelihood:
     """Return the likelihood in which delays of recorded drives that jump between two samples start from a grid.
 
     Each sample that such a jump passes is a minimum.
     """
     for i, channel in _delayed_channels(likelihood):
-        drive = channel.electrical.drive
-        assert isinstance(drive, Sampled)
-        if has_unresolved_edge(np.asarray(drive.samples)):
+        if has_unresolved_edge(sources[i].in_time):
             at_theta = likelihood.channel_inputs(theta, i), likelihood.evaluate_circuit(theta)
             likelihood = likelihood.replace_channel(i, free_timing(channel, *at_theta, "delay"))
     return likelihood
@@ -129,11 +129,14 @@ def curve_drives(
         assert isinstance(drive, Sampled)
         assert smooth is not None
         late = theta[likelihood.names.index(channel.qualified_name("delay"))]
-        step, lag = float(channel.timing.step), 0.0
+        step, circuit = float(channel.timing.step), likelihood.evaluate_circuit(theta)
         late += float(channel.timing.shift) / step
-        if limits_current(likelihood.template):  # whose resistance makes Vsc later, too
-            lag = min(float(likelihood.evaluate_circuit(theta).tau[-1]) / step, 1.0)
-        curved = pad_samples(curve_drive(smooth[: len(record)], late, record.tones, lag))
+        if record.tones is not None:
+            curved = curve_tones(record.tones, late, circuit.terms[channel.channel], step)
+        else:  # a resistance makes Vsc later, too
+            lag = min(float(circuit.tau[-1]) / step, 1.0) if limits_current(likelihood.template) else 0.0
+            curved = curve_drive(smooth[: len(record)], late, lag)
+        curved = pad_samples(curved)
         changes = np.asarray(electrical.noise_gain) * (curved - now) / sigma[i]
         if np.linalg.norm(changes * np.sqrt(channel.samples.weights)) > max_change:
             drive = dataclasses.replace(drive, samples=curved + (np.asarray(drive.samples) - now))

@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
+from jaxtyping import Float
 
 from fitact.compiled import array_module
 from fitact.data.tones import Tones
+from fitact.model.loop_modes import HighpassTerms
 
 # 2 S - S^2 of the mean S with the weights 1, 4, 6, 4 and 1 of a cubic B-spline, which leaves a cubic as it is
 _WEIGHTS = np.array([-1.0, -8.0, 4.0, 72.0, 122.0, 72.0, 4.0, -8.0, -1.0]) / 256.0
@@ -54,16 +56,31 @@ def lasting_bend(V: Any) -> Any:
     return xp.maximum(xp.minimum(before, after), xp.minimum(xp.maximum(before, after), here))
 
 
-def curve_drive(smooth: Any, late: float, tones: Tones | None, lag: float = 0.0) -> Any:
+def curve_drive(smooth: Any, late: float, lag: float = 0.0) -> Any:
     """Return a smooth drive (samples, V) between whose samples lines are a curve, where it is `late` (time steps).
 
-    That of a drive of few tones is known; others lack a part of their second differences. A low-pass with the time
-    constant `lag` (time steps) reads the drive later by an exponential distribution.
+    A low-pass with the time constant `lag` (time steps) reads the drive later by an exponential distribution.
     """
     lates = late - lag * np.log1p(-(np.arange(16) + 0.5) / 16.0) if lag else np.array([late])
-    if tones is None:
-        return smooth + np.mean(missing_curve(lates)) * lasting_bend(smooth)
-    return sum(map(tones.values_for_lines, lates)) / lates.size
+    return smooth + np.mean(missing_curve(lates)) * lasting_bend(smooth)
+
+
+def curve_tones(tones: Tones, late: float, terms: HighpassTerms, step: float = 1.0) -> Float[np.ndarray, " samples"]:
+    """Return samples of a drive (V) to which, with lines between them, `terms` respond as they do to its tones.
+
+    Steady responses are compared at the samples, where they are `late` (time steps of `step` s).
+    """
+    turns, part = 1j * tones.frequencies, late % 1.0
+    back = np.exp(-turns)
+    direct = complex(0.0 if terms.direct is None else terms.direct)
+    exact, made = direct * np.exp(-turns * part), direct * (1.0 - part + part * back)
+    for weight, tau in zip(terms.weight, terms.tau, strict=True):
+        age = step / float(tau)
+        exact = exact + float(weight) * turns / (turns + age) * np.exp(-turns * part)
+        before = -np.expm1(-age) / age * (1.0 - back) / (1.0 - np.exp(-age) * back)  # response at a sample
+        since = (1.0 - part) * age  # its decay and the rise of the line from the sample before
+        made = made + float(weight) * (np.exp(-since) * back * before - np.expm1(-since) / age * (1.0 - back))
+    return tones.mean + tones.scale(exact / made)
 
 
 def missing_curve(late: ArrayLike) -> ArrayLike:

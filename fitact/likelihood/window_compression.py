@@ -33,7 +33,8 @@ from fitact.likelihood.projection import (
     evaluate_baseline,
     factor_products,
 )
-from fitact.likelihood.smooth_drive import curve_drive, smooth_drive
+from fitact.likelihood.smooth_drive import curve_drive, curve_tones, smooth_drive
+from fitact.model.loop_modes import HighpassTerms
 from fitact.model.response_table import count_nodes
 
 REACH = 4.0  # factor by which b may change
@@ -236,7 +237,10 @@ class WindowCompressor:
         tones = self.tones and self.tones.continue_with(V)
         smooth = smooth_drive(V, self.noise_V, tones) if self.noise_V else V
         number = np.arange(float(V.size))
-        return smooth, np.interp(number - self.late, number, curve_drive(smooth, self.late, tones) - smooth)
+        curved = (
+            curve_tones(tones, self.late, HighpassTerms((), (), None, 1.0)) if tones else curve_drive(smooth, self.late)
+        )
+        return smooth, np.interp(number - self.late, number, curved - smooth)
 
 
 class WindowProducts(NamedTuple):

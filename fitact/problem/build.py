@@ -479,7 +479,7 @@ def _hum(record: Record, choice: DriveModel) -> list[str]:
 
 def _unresolved_gain_sd(record: Record, choice: DriveModel, start: VscEstimate) -> float:
     """Return the sd of log(gain) that stands for unresolved edges of a measured drive."""
-    if choice.name != "measured" or not has_unresolved_edge(choice.voltage) or not math.isfinite(start.b):
+    if choice.name != "measured" or not has_unresolved_edge(record) or not math.isfinite(start.b):
         return 0.0
     return edge_gain_sd(record.time_step, start.b)
 

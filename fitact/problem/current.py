@@ -9,7 +9,7 @@ import scipy
 from jaxtyping import Bool
 
 from fitact.data.record import Record
-from fitact.likelihood.charge_rows import LAG, RowCovariance, filter_highpass, step_means, whiten_rows
+from fitact.likelihood.charge_rows import LAG, MAX_STEPS, RowCovariance, filter_highpass, step_means, whiten_rows
 from fitact.problem.drive_choice import DriveModel, drive_slope, unit_response
 from fitact.problem.jumps import block_medians
 from fitact.problem.recorded_current import Current, RecordedCurrent, solve_linear, thin_rows
@@ -119,8 +119,9 @@ def _scan_recorded(
     several = math.ceil((current.I.size - 3 * LAG) / most)
     first, count = 2 * LAG, (current.I.size - 2 * LAG) // several
     step = current.step * several
-    lost = thin_rows(current.excluded_rows(current.start_delay) * 1.0, several) > 0.0
-    (means, uncertain), rounded = current.step_means(Current(C, 0.0, current.start_delay)), current.rounded
+    delay = max(current.start_delay - lag / current.step, float(-MAX_STEPS))
+    lost = thin_rows(current.excluded_rows(delay) * 1.0, several) > 0.0
+    (means, uncertain), rounded = current.step_means(Current(C, 0.0, delay)), current.rounded
     common = np.roll(rounded.variance * rounded.alike * run_lengths(rounded.group), LAG)
     own = current.noise_I**2 / several + thin_rows(uncertain * current.jumps.alike + common, several) / several
     own += 1e-24 * float(np.ptp(current.I)) ** 2
@@ -128,11 +129,14 @@ def _scan_recorded(
     noise_V = float(np.mean(current.variance_V)) * (1.0 - decay) / (1.0 + decay)
 
     V, _ = scipy.signal.lfilter([1.0 - decay], [1.0, -decay], current.V, zi=decay * current.V[:1])
+    is_exact = current.tones is not None
+    if current.tones is not None:  # which are known between the samples, and without noise
+        V, noise_V = current.tones.scale(1.0 / (1.0 + 1j * current.tones.frequencies * lag / current.step)), 0.0
     V = V[first - LAG :: several][: count + 1]
     V = np.pad(V, (0, count + 1 - V.size), mode="edge")
     time = step * np.arange(count)
     observed = thin_rows(means - stray * rise, several)
-    own += (lag > 0.0) * np.square(np.gradient(observed) / several)
+    own += (lag > 0.0 and not is_exact) * np.square(np.gradient(observed) / several)
     fixed = np.stack([np.diff(V) / step, np.ones(count), *_waves(hum, time), observed])
 
     @functools.lru_cache

@@ -93,7 +93,7 @@ def choose_drive(record: Record, scene: Scene | None) -> DriveModel:
 def _measured_drive(record: Record, steady_state: bool | None, notes: tuple[str, ...]) -> DriveModel:
     voltage = record["V"]
     warnings: tuple[str, ...] = ()
-    if has_unresolved_edge(voltage):
+    if has_unresolved_edge(record):
         warnings = (
             "V_V jumps within one sampling interval, so the times of its edges, and with them g, are uncertain by up to"
             " one interval (a free gain accounts for it); record faster, or state the waveform in a scene",
@@ -208,9 +208,10 @@ def _mismatch(record: Record, voltage: np.ndarray) -> float:
     return float(np.sqrt(excess / np.mean(voltage**2)))
 
 
-def has_unresolved_edge(voltage: Float[np.ndarray, " samples"]) -> bool:
-    """Return whether a drive jumps by most of its height between two samples."""
-    return bool(has_unresolved_edges(np.max(np.abs(np.diff(voltage))), np.ptp(voltage)))
+def has_unresolved_edge(record: Record) -> bool:
+    """Return whether V jumps by most of its height between two samples, and is no fast tone."""
+    largest, height = np.max(np.abs(np.diff(record["V"]))), np.ptp(record["V"])
+    return bool(has_unresolved_edges(largest, height)) and record.tones is None
 
 
 def has_unresolved_edges(largest_step: ArrayLike, height: ArrayLike) -> Bool[np.ndarray, "*records"]:

@@ -106,7 +106,7 @@ def set_drive(
     taps = path.whitening_taps(math.sqrt(least), own)
     from_V = path.respond(taps)
     # V differs from the chord by 1/12 of the bend in the mean; at a corner, which has the rest of it, slopes by a third
-    sizes = np.abs([current.bend, current.bend - current.lasting_bend])
+    sizes = np.abs([current.bend, current.bend - current.lasting_bend]) * (current.tones is None)  # those are known
     bend, corner = scipy.ndimage.maximum_filter1d(sizes, 3)
     in_mean, between = 0.1 * min(-math.log(max(path.decay, 1e-9)), 3.0), math.hypot(0.1, path.direct / 3.0)
     alone, varying = (

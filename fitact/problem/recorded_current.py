@@ -129,7 +129,8 @@ class RecordedCurrent:
         `is_whole`: whether they are a whole record, and not a window of one, whose delay others determine.
         """
         rounded = RoundedSteps.from_samples(current, step_I)
-        jumps = Jumps.from_samples(V, current, (math.hypot(*noise_V), noise), is_whole)
+        smooth = np.zeros(V.size)  # the current of tones, of which fast ones would be taken for jumps
+        jumps = Jumps.from_samples(V, smooth if tones else current, (math.hypot(*noise_V), noise), is_whole)
         # the flat top of a pulse that is coarsely rounded looks clipped, but lies within the range of the converter
         codes = np.log2(np.maximum(np.abs([current.min(), current.max()]) / (step_I or 1.0), 1.0))
         is_rounded = (
@@ -162,11 +163,22 @@ class RecordedCurrent:
 
     @functools.cached_property
     def start_delay(self) -> float:
-        """Delay of I in time steps, from which a fit starts: that of a carrier, whose current follows dV/dt; else 0."""
-        if self.tones is None or self.tones.carrier is None:
+        """Delay of I in time steps, from which a fit starts: that of fast tones, whose I follows dV/dt; else 0."""
+        if self.tones is None or self._tones_I is None:
             return 0.0
-        phase = np.angle(self.tones.carrier_gain(self.I) / 1j)
-        return float(np.clip(-phase / self.tones.carrier, -MAX_STEPS, MAX_STEPS))
+        turns, currents = self.tones.frequencies, self._tones_I.phasors
+        fast = turns >= 0.5 * np.max(turns)
+        if self.tones.carrier is None and np.count_nonzero(fast) < 3:
+            return 0.0
+        turns, currents = turns[fast], (currents / (1j * self.tones.phasors))[fast]
+        size = np.abs(currents * self.tones.phasors[fast])
+        grid = np.linspace(-MAX_STEPS, MAX_STEPS, 241)
+        delay = grid[np.argmax(((currents / np.abs(currents) * size) @ np.exp(1j * np.outer(turns, grid))).real)]
+        phase = np.angle(currents * np.exp(1j * turns * delay))
+        # the skin makes I earlier by a phase that falls with the frequency, of which a carrier has one
+        columns = np.stack([-turns, 1.0 / turns][: 1 if self.tones.carrier else 2]).T
+        delay += np.linalg.lstsq(columns * size[:, None], phase * size)[0][0]
+        return float(np.clip(delay, -MAX_STEPS, MAX_STEPS))
 
     @property
     def is_coarse(self) -> bool:
@@ -231,17 +243,24 @@ class RecordedCurrent:
     def step_means(self, modelled: Current) -> tuple[Rows, Rows]:
         """Return the rows of the mean current over each step, and their variance beyond that of noise, A^2."""
         means, variance = self.jumps.step_means(self.I, modelled.delay, self.noise_I)
-        means *= self._carrier_correction(modelled.delay)
+        means += self._missing_tones(modelled.delay)
         kink = modelled.conductance * self.step / max(modelled.capacitance, 1e-15)  # of what does not follow dV/dt
         return means, variance + self.jumps.kink_variance(self.I.size) * kink**2
 
-    def _carrier_correction(self, delay: float) -> float:
-        """Return the mean of a carrier over a step, over that by `step_means`: 1.0003 for ten samples in a period."""
-        frequency = self.tones and self.tones.carrier
-        if frequency is None:
-            return 1.0
-        taps, _ = mean_filter(delay)
-        return float(np.sinc(frequency / (2.0 * math.pi)) / abs(np.exp(-1j * frequency * np.arange(taps.size)) @ taps))
+    def _missing_tones(self, delay: float) -> ArrayLike:
+        """Return what `step_means` takes from the tones of I: 3e-4 of one with ten samples in a period, A."""
+        if self._tones_I is None:
+            return 0.0
+        taps, shift = mean_filter(delay)
+        turns = self._tones_I.frequencies
+        made = np.exp(-1j * np.outer(turns, shift + np.arange(taps.size))) @ taps
+        mean = np.exp(1j * turns * (delay + 0.5 - LAG)) * np.sinc(turns / (2.0 * math.pi))
+        return self._tones_I.scale(mean - made)
+
+    @functools.cached_property
+    def _tones_I(self) -> Tones | None:
+        """Tones of I at the frequencies of those of V."""
+        return self.tones and self.tones.from_samples(self.I, self.tones.frequencies, rounds=1)
 
     def rise(self, V: Rows, lag: float = 0.0) -> Rows:
         """Return the rise of a drive over each step, V/s, stored as rows are.
@@ -249,7 +268,10 @@ class RecordedCurrent:
         With a `lag` (time steps) it is that of the drive behind a low-pass of this time constant, which weakens what is
         fast besides making it later: 1 / (1 + s) = e^{-s} (1 + s^2 / 2 + ...).
         """
-        if lag:
+        if lag and self.tones is not None:
+            turns = 1j * lag * self.tones.frequencies
+            V = V + self.tones.scale(np.exp(turns) / (1.0 + turns) - 1.0)
+        elif lag:
             bend = self.lasting_bend  # from which its own bend leads to the second derivative
             V = V + 0.5 * lag**2 * (bend - lasting_bend(bend) / 12.0)
         return np.concatenate([np.zeros(LAG), np.diff(V)[: 1 - LAG] / self.step])

@@ -147,6 +147,15 @@ def simulate_bench(
     return fitact.Record.from_arrays(made.time, **made.channels, source="bench")
 
 
+# a Schroeder multisine of twenty tones
+MULTISINE = {
+    "waveform": "multitone",
+    "frequencies": [320.0 * n for n in range(1, 40, 2)],
+    "amplitudes": [15.0] * 20,
+    "phases": [-math.pi * n * (n - 1) / 40.0 for n in range(1, 40, 2)],
+}
+
+
 def errors(found: fitact.Fit) -> np.ndarray:
     """Return the errors of Rsc, Csc and Ci in standard uncertainties."""
     parameters = found.parameters()
@@ -224,10 +233,14 @@ def test_edges_that_set_the_range_of_I_leave_its_plateaus_to_few_steps():
         pytest.param(
             {"waveform": "trapezoid", "peak_to_peak": 200.0, "frequency": 80.0, "rise_time": 200e-6}, 100e3, id="edges"
         ),
+        pytest.param(MULTISINE, 100e3, id="multisine"),
     ],
 )
 def test_vsc_and_a_current_through_a_resistance(drive: dict[str, object], rate: float):
-    """A sine ended 41 u away, with a start 40 times too large; at 10 kHz, 2 kohm weaken I by 0.4 %, 15 u."""
+    """A sine ended 41 u away, with a start 40 times too large; at 10 kHz, 2 kohm weaken I by 0.4 %, 15 u.
+
+    A multisine whose fastest tone has eight samples a period was a misfit, 20 u away.
+    """
     record = simulate_bench(drive, 14, rate, {"V": 0.1, "Vsc": 2e-3, "I": 40e-9}, 2000.0, late=0.3)
     content = bench_scene(["Vsc", "I"]).model_dump(exclude_unset=True)
     found = fitact.fit(record, fitact.Scene.from_dict({**content, "grounding": {"R_H": 2000.0}}))
@@ -246,6 +259,16 @@ def test_a_current_tells_a_Ci_that_nobody_stated(given: fitact.Scene | None):
     assert np.max(np.abs(errors(found))) < 4.0
     assert found.parameters()["Ci"]["u"] < 0.02
     assert any("Ci = 1.35 nF within a factor of 20" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("late", [0.3, 1.4])
+def test_a_multisine_of_few_samples_a_period_tells_the_circuit_from_I(late: float):
+    """Eight samples: the delay was not found before the circuit, and lines between samples told a wrong one."""
+    found = fitact.fit(
+        simulate_bench(MULTISINE, 12, 100e3, {"V": 0.1, "Vsc": 2e-3, "I": 4e-6}, late=late), bench_scene(["I"])
+    )
+    assert found.trusted
+    assert np.max(np.abs(errors(found))) < 4.0
 
 
 @pytest.mark.parametrize(("lag", "omega"), [(0.2, 0.6), (0.33, 0.6), (0.33, 0.2)])
