@@ -130,7 +130,7 @@ class Record(Display):
             if tones is None:
                 white = white_noise_sd(values[valid])
             else:  # fast ones would be taken for noise
-                rest = values - tones.from_samples(values, tones.frequencies, rounds=1).values()
+                rest = values - (tones if channel == "V" else tones.fit_phasors(values)).values()
                 beside = math.sqrt(max(float(np.var(rest)) - rounding**2, 0.0))
                 white = beside if channel == "V" else white_noise_sd(rest[valid])
             self._estimates["noise", channel] = white, rounding

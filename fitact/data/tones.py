@@ -56,6 +56,10 @@ class Tones(NamedTuple):
         tones = self.from_samples(values, self.frequencies, self.rounding)
         return tones if _is_noise(values - tones.values(), self.rounding) else None
 
+    def fit_phasors(self, values: Samples) -> Self:
+        """Return the tones of other samples at the same frequencies, by linear least squares."""
+        return self.from_samples(values, self.frequencies, rounds=1)
+
     @property
     def carrier(self) -> float | None:
         """Frequency of the strongest tone (rad per sample), if a delay changes the phases more than a finger does."""
@@ -63,7 +67,7 @@ class Tones(NamedTuple):
 
     def carrier_gain(self, values: Samples) -> complex:
         """Return the gain of other samples over the strongest tone."""
-        phasors = self.from_samples(values, self.frequencies, rounds=1).phasors
+        phasors = self.fit_phasors(values).phasors
         return complex(phasors[self._strongest] / self.phasors[self._strongest])
 
     def values(self) -> Samples:

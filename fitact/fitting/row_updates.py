@@ -84,12 +84,13 @@ def _update_drive(
     noise += stray * np.roll(rise, steps)
     path = NoisePath.from_terms(circuit.terms[channel.channel], stray, step)
     known = respond(current.smooth, late)
-    if current.tones is not None:  # whose residuals tell nothing of the drive, and would draw a delay along
+    if current.tones is not None:
         terms = circuit.terms[channel.channel]
         terms = terms._replace(rate=(terms.rate or 0.0) + stray)
         noise += _missing_response(current.tones, terms, float(shift + inputs.delay), known, record)
-        return replace_drive(set_drive(full, path, record, current.smooth, noise), record, current.smooth, noise)
     full = set_drive(full, path, record, current.smooth, noise)
+    if current.tones is not None:  # whose residuals tell nothing of the drive, and would draw a delay along
+        return full
     V = estimate_drive(full, path, sample_residuals(full, inputs, sigma)[1], record)
     return replace_drive(full, record, V, noise + known - respond(V, late))
 

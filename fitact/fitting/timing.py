@@ -129,12 +129,14 @@ def curve_drives(
         assert isinstance(drive, Sampled)
         assert smooth is not None
         late = theta[likelihood.names.index(channel.qualified_name("delay"))]
-        step, circuit = float(channel.timing.step), likelihood.evaluate_circuit(theta)
+        step, lag = float(channel.timing.step), 0.0
         late += float(channel.timing.shift) / step
         if record.tones is not None:
-            curved = curve_tones(record.tones, late, circuit.terms[channel.channel], step)
-        else:  # a resistance makes Vsc later, too
-            lag = min(float(circuit.tau[-1]) / step, 1.0) if limits_current(likelihood.template) else 0.0
+            terms = likelihood.evaluate_circuit(theta).terms[channel.channel]
+            curved = curve_tones(record.tones, late, terms, step)
+        else:
+            if limits_current(likelihood.template):  # whose resistance makes Vsc later, too
+                lag = min(float(likelihood.evaluate_circuit(theta).tau[-1]) / step, 1.0)
             curved = curve_drive(smooth[: len(record)], late, lag)
         curved = pad_samples(curved)
         changes = np.asarray(electrical.noise_gain) * (curved - now) / sigma[i]

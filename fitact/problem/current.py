@@ -125,18 +125,12 @@ def _scan_recorded(
     common = np.roll(rounded.variance * rounded.alike * run_lengths(rounded.group), LAG)
     own = current.noise_I**2 / several + thin_rows(uncertain * current.jumps.alike + common, several) / several
     own += 1e-24 * float(np.ptp(current.I)) ** 2
-    decay = math.exp(-current.step / lag) if lag > 0.0 else 0.0
-    noise_V = float(np.mean(current.variance_V)) * (1.0 - decay) / (1.0 + decay)
-
-    V, _ = scipy.signal.lfilter([1.0 - decay], [1.0, -decay], current.V, zi=decay * current.V[:1])
-    is_exact = current.tones is not None
-    if current.tones is not None:  # which are known between the samples, and without noise
-        V, noise_V = current.tones.scale(1.0 / (1.0 + 1j * current.tones.frequencies * lag / current.step)), 0.0
+    V, noise_V, is_exact = _pass_low(current, lag)
     V = V[first - LAG :: several][: count + 1]
     V = np.pad(V, (0, count + 1 - V.size), mode="edge")
     time = step * np.arange(count)
     observed = thin_rows(means - stray * rise, several)
-    own += (lag > 0.0 and not is_exact) * np.square(np.gradient(observed) / several)
+    own += (not is_exact) * np.square(np.gradient(observed) / several)
     fixed = np.stack([np.diff(V) / step, np.ones(count), *_waves(hum, time), observed])
 
     @functools.lru_cache
@@ -174,6 +168,18 @@ def _scan_recorded(
     time = current.step * (np.arange(current.I.size) - first)
     decays = np.exp(-np.maximum(time, -step) / estimate.b)
     return estimate, amplitudes[1] * decays + amplitudes[3:] @ np.stack([np.ones_like(time), *_waves(hum, time)])
+
+
+def _pass_low(current: RecordedCurrent, lag: float) -> tuple[Rows, float, bool]:
+    """Return V behind a low-pass with the time constant `lag` (s), the variance of its noise, and whether it is exact.
+
+    Tones are known between the samples, and without noise.
+    """
+    if current.tones is not None:
+        return current.tones.scale(1.0 / (1.0 + 1j * current.tones.frequencies * lag / current.step)), 0.0, True
+    decay = math.exp(-current.step / lag) if lag > 0.0 else 0.0
+    V, _ = scipy.signal.lfilter([1.0 - decay], [1.0, -decay], current.V, zi=decay * current.V[:1])
+    return V, float(np.mean(current.variance_V)) * (1.0 - decay) / (1.0 + decay), lag == 0.0
 
 
 def _waves(frequencies: Sequence[float], time: Rows) -> list[Rows]:

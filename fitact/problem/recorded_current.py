@@ -129,8 +129,8 @@ class RecordedCurrent:
         `is_whole`: whether they are a whole record, and not a window of one, whose delay others determine.
         """
         rounded = RoundedSteps.from_samples(current, step_I)
-        smooth = np.zeros(V.size)  # the current of tones, of which fast ones would be taken for jumps
-        jumps = Jumps.from_samples(V, smooth if tones else current, (math.hypot(*noise_V), noise), is_whole)
+        may_jump = current if tones is None else np.zeros(V.size)  # fast tones would be taken for jumps
+        jumps = Jumps.from_samples(V, may_jump, (math.hypot(*noise_V), noise), is_whole)
         # the flat top of a pulse that is coarsely rounded looks clipped, but lies within the range of the converter
         codes = np.log2(np.maximum(np.abs([current.min(), current.max()]) / (step_I or 1.0), 1.0))
         is_rounded = (
@@ -166,15 +166,14 @@ class RecordedCurrent:
         """Delay of I in time steps, from which a fit starts: that of fast tones, whose I follows dV/dt; else 0."""
         if self.tones is None or self._tones_I is None:
             return 0.0
-        turns, currents = self.tones.frequencies, self._tones_I.phasors
-        fast = turns >= 0.5 * np.max(turns)
+        fast = self.tones.frequencies >= 0.5 * np.max(self.tones.frequencies)
         if self.tones.carrier is None and np.count_nonzero(fast) < 3:
             return 0.0
-        turns, currents = turns[fast], (currents / (1j * self.tones.phasors))[fast]
-        size = np.abs(currents * self.tones.phasors[fast])
+        turns, currents = self.tones.frequencies[fast], self._tones_I.phasors[fast]
+        size, late = np.abs(currents), np.angle(currents / (1j * self.tones.phasors[fast]))
         grid = np.linspace(-MAX_STEPS, MAX_STEPS, 241)
-        delay = grid[np.argmax(((currents / np.abs(currents) * size) @ np.exp(1j * np.outer(turns, grid))).real)]
-        phase = np.angle(currents * np.exp(1j * turns * delay))
+        delay = grid[np.argmax(size @ np.cos(late[:, None] + np.outer(turns, grid)))]
+        phase = np.angle(np.exp(1j * (late + turns * delay)))
         # the skin makes I earlier by a phase that falls with the frequency, of which a carrier has one
         columns = np.stack([-turns, 1.0 / turns][: 1 if self.tones.carrier else 2]).T
         delay += np.linalg.lstsq(columns * size[:, None], phase * size)[0][0]
@@ -260,7 +259,7 @@ class RecordedCurrent:
     @functools.cached_property
     def _tones_I(self) -> Tones | None:
         """Tones of I at the frequencies of those of V."""
-        return self.tones and self.tones.from_samples(self.I, self.tones.frequencies, rounds=1)
+        return self.tones and self.tones.fit_phasors(self.I)
 
     def rise(self, V: Rows, lag: float = 0.0) -> Rows:
         """Return the rise of a drive over each step, V/s, stored as rows are.

@@ -74,9 +74,7 @@ def test_lines_between_samples_are_the_tones(late: float, tau: float | None):
     if tau is not None:
         lines = scipy.signal.lsim(([tau, 0.0], [tau, 1.0]), lines, steps)[1]
     read, exact = np.interp(k - late, steps, lines), (gain @ np.exp(1j * np.outer(omega, k - late))).real
-    np.testing.assert_allclose(
-        read[100:300], exact[100:300] + (3.0 if tau is None else 0.0), atol=2e-3 if late % 1.0 else 1e-6
-    )
+    np.testing.assert_allclose(read[100:300], exact[100:300] + (3.0 if tau is None else 0.0), atol=1e-9)
 
 
 def record(

@@ -239,7 +239,7 @@ def test_edges_that_set_the_range_of_I_leave_its_plateaus_to_few_steps():
 def test_vsc_and_a_current_through_a_resistance(drive: dict[str, object], rate: float):
     """A sine ended 41 u away, with a start 40 times too large; at 10 kHz, 2 kohm weaken I by 0.4 %, 15 u.
 
-    A multisine whose fastest tone has eight samples a period was a misfit, 20 u away.
+    A multisine whose fastest tone has eight samples a period was a misfit, 42 standard errors away.
     """
     record = simulate_bench(drive, 14, rate, {"V": 0.1, "Vsc": 2e-3, "I": 40e-9}, 2000.0, late=0.3)
     content = bench_scene(["Vsc", "I"]).model_dump(exclude_unset=True)
@@ -263,7 +263,7 @@ def test_a_current_tells_a_Ci_that_nobody_stated(given: fitact.Scene | None):
 
 @pytest.mark.parametrize("late", [0.3, 1.4])
 def test_a_multisine_of_few_samples_a_period_tells_the_circuit_from_I(late: float):
-    """Eight samples: the delay was not found before the circuit, and lines between samples told a wrong one."""
+    """Lines between eight samples made both a misfit, the first 700 standard errors away."""
     found = fitact.fit(
         simulate_bench(MULTISINE, 12, 100e3, {"V": 0.1, "Vsc": 2e-3, "I": 4e-6}, late=late), bench_scene(["I"])
     )
