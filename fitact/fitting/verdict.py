@@ -4,15 +4,14 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+import scipy
 from jaxtyping import Float
 
-from fitact.compiled import BatchEvaluator
 from fitact.fitting.channel_fit import ChannelFit
 from fitact.fitting.least_squares import LeastSquaresResult
 from fitact.fitting.minimum import Optima
 from fitact.fitting.residual_statistics import is_misfit
 from fitact.likelihood.likelihood import Likelihood
-from fitact.prior.distributions import Bounded
 from fitact.prior.product import Product
 
 
@@ -37,40 +36,49 @@ def is_out_of_bounds(
     theta: Float[np.ndarray, " parameters"],
     sigma: Float[np.ndarray, " channels"],
     covariance_factor: Float[np.ndarray, "parameters parameters"],
-    half_width: float = 6.0,
+    blind: float = 6.0,
+    noise: float = 5.0,
 ) -> bool:
-    """Return whether the data put the parameters where a bounded or ordered prior forbids them.
+    """Return whether the data put the parameters where a bounded or ordered prior, or an instrument, forbids them.
 
     Least squares use the mean and covariance of a prior. In the direction that the data determine least the optimum
-    may therefore lie outside a bound, which the sampler corrects. The test passes if any point in that direction,
-    within `half_width` standard deviations, is allowed. An exponent of 1 is a constant skin: where noise alone
-    explains an exponent above 1, the line goes through 1.
+    may therefore lie outside a bound, by `blind` standard deviations, which the sampler corrects. Limits of instruments
+    and geometry, and an exponent of 1, which is a constant skin, may be missed by what noise explains: `noise`
+    standard deviations in any direction.
     """
     prior = likelihood.prior
-    is_bounded = any(isinstance(each, Bounded) for each in (*prior.marginals, *likelihood.sigma_prior))
-    if not is_bounded and not prior.order_constraints:
-        return False
-    axes, sizes, _ = np.linalg.svd(covariance_factor)
-    along = np.linspace(-half_width, half_width, 241)[:, None] * (axes[:, 0] * sizes[0])
-    points = np.hstack([_clip_exponent(likelihood, theta, covariance_factor) + along, np.tile(np.log(sigma), (241, 1))])
-    for i, marginal in enumerate(prior.marginals):
-        if isinstance(marginal, Product):  # limits of an instrument, which bound no parameter of the circuit
-            points[:, i] = np.clip(points[:, i], marginal.edges[0], marginal.edges[-1])
-    evaluate = BatchEvaluator(Likelihood.log_prior, likelihood.without_samples(), points.shape[1], 256, fast=False)
-    return not np.any(np.isfinite(evaluate(points)))
+    for each, log in zip(likelihood.sigma_prior, np.log(sigma), strict=True):
+        if each is not None and not each.support[0] <= log <= each.support[1]:
+            return True
+    axes = np.eye(theta.size)
+    orders = [[axes[prior.names.index(name)] for name in pair] for pair in prior.order_constraints]
+    strict, loose = [(higher - lower, 0.0) for lower, higher in orders], list[tuple[np.ndarray, float]]()
+    for axis, name, marginal in zip(axes, prior.names, prior.marginals, strict=False):
+        chosen = loose if name == "alpha" or isinstance(marginal, Product) else strict
+        low, high = marginal.support
+        chosen += [(sign * axis, sign * bound) for sign, bound in ((1.0, low), (-1.0, high)) if math.isfinite(bound)]
+    directions, sizes, _ = np.linalg.svd(covariance_factor)
+    least_determined = directions[:, :1] * sizes[0]
+    cases = (strict, least_determined, blind), (loose, covariance_factor, noise)
+    return any(_distance(limits, theta, factor) > allowed for limits, factor, allowed in cases)
 
 
-def _clip_exponent(likelihood: Likelihood, theta: np.ndarray, covariance_factor: np.ndarray) -> np.ndarray:
-    """Return theta, or the most probable point with the fractional exponent at its bound if noise explains that."""
-    if "alpha" not in likelihood.prior.names:
-        return theta
-    place, high = likelihood.prior.names.index("alpha"), getattr(likelihood.prior["alpha"], "high", 1.0)
-    excess, spread = theta[place] - math.log(high), np.linalg.norm(covariance_factor[place])
-    if not 0.0 < excess < 4.0 * spread:  # further than noise explains
-        return theta
-    moved = theta - covariance_factor @ covariance_factor[place] * (excess / spread**2)
-    moved[place] = math.log(high) * (1.0 + 1e-12) - 1e-12  # rounding must not put it outside
-    return moved
+def _distance(
+    limits: Sequence[tuple[Float[np.ndarray, " parameters"], float]],
+    theta: Float[np.ndarray, " parameters"],
+    factor: Float[np.ndarray, "parameters directions"],
+) -> float:
+    """Return the norm of the shortest z with which theta + factor z is within all limits, a @ theta >= c for (a, c).
+
+    That is Gz >= h. The residual of Eu = (0, ..., 0, 1) for u >= 0, with E = (G, h)^T, has the squared norm
+    1 / (1 + z^T z) (C. Lawson and R. Hanson, Solving Least Squares Problems, 1974, chapter 23).
+    """
+    E = np.array([[*(row @ factor), bound - row @ theta] for row, bound in limits]).T
+    if not limits or np.all(E[-1] <= 0.0):
+        return 0.0
+    lengths = np.linalg.norm(E, axis=0)
+    _, residual = scipy.optimize.nnls(E[:, lengths > 0.0] / lengths[lengths > 0.0], np.eye(len(E))[-1])
+    return math.sqrt(max(residual**-2 - 1.0, 0.0)) if residual > 0.0 else math.inf
 
 
 def misfit_warnings(traces: Sequence[ChannelFit]) -> list[str]:

@@ -37,6 +37,11 @@ class Distribution(eqx.Module):
         """Standard deviation of log x."""
         return type(self).log_moments(self)[1]
 
+    @property
+    def support(self) -> tuple[float, float]:
+        """Bounds of u = log x; infinite without bounds."""
+        return -math.inf, math.inf
+
     @abc.abstractmethod
     def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """Return the log-density of u = log x, Jacobian included; -inf outside the support."""
@@ -119,11 +124,14 @@ class Bounded(Distribution):
     def ppf(self, p: ArrayLike) -> Float[Array, "*shape"]:
         """Return log x, the inverse of `cdf`."""
 
+    @property
+    def support(self) -> tuple[float, float]:
+        return -math.inf if self.low == 0.0 else math.log(self.low), math.log(self.high)
+
     def contains(self, u: ArrayLike) -> Array:
         """Return whether u = log x lies within the bounds."""
-        u = array_module(u).asarray(u)
-        low = -math.inf if self.low == 0.0 else math.log(self.low)
-        return (u >= low) & (u <= math.log(self.high))
+        u, (low, high) = array_module(u).asarray(u), self.support
+        return (u >= low) & (u <= high)
 
     def to_standard_normal(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """Return the standard normal z = Phi^-1(F(u))."""

@@ -31,6 +31,10 @@ class Product(Distribution):
     def log_moments(self) -> tuple[float, float]:
         return self.mean, self.sd
 
+    @property
+    def support(self) -> tuple[float, float]:
+        return float(self.edges[0]), float(self.edges[-1])
+
     def log_density(self, u: ArrayLike) -> Float[Array, "*shape"]:
         """Return the log-density of u = log x, interpolated between the centers of the cells."""
         width = self.edges[1] - self.edges[0]

@@ -337,8 +337,8 @@ def _draw_starting_points(
         if len(points) >= walkers:
             return points[:walkers], values[:walkers]
     raise InputError(
-        "scene: the bounds of [prior] exclude, or nearly exclude, the g and b of the record; widen them, or check the"
-        " units of the record"
+        "scene: the bounds of [prior] or the limits of [instrument] exclude, or nearly exclude, what the record shows;"
+        " `fitact fit` says where; widen them, or check the units of the record and the circuit of the scene"
     )
 
 

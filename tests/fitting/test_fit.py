@@ -348,9 +348,25 @@ def test_from_rest_with_what_was_recorded_before_the_trigger():
 
 
 @pytest.mark.slow
-def test_huge_offset_is_not_trusted(finger_path):
+def test_a_huge_offset_changes_nothing(finger_path):
+    """1 MV has steps of 0.1 nV in double precision, far below the noise."""
     record = fitact.read(finger_path)
-    assert not fitact.fit(fitact.Record.from_arrays(record.time, V=record["V"], Vsc=record["Vsc"] + 1e6)).trusted
+    found, moved = (
+        fitact.fit(fitact.Record.from_arrays(record.time, V=record["V"], Vsc=record["Vsc"] + offset))
+        for offset in (0.0, 1e6)
+    )
+    assert moved.trusted
+    for name in ("g", "b"):
+        assert abs(deviation(moved, name, found.derived()[name]["q50"])) < 0.01
+        assert moved.derived()[name]["sd"] == pytest.approx(found.derived()[name]["sd"], rel=1e-4)
+
+
+@pytest.mark.slow
+def test_an_offset_that_rounds_the_signal_tells_nothing(finger_path):
+    """1e14 V has steps of 16 mV, and the sums over the samples hold no more than half of the digits."""
+    record = fitact.read(finger_path)
+    fit = fitact.fit(fitact.Record.from_arrays(record.time, V=record["V"], Vsc=record["Vsc"] + 1e14))
+    assert fit.derived()["g"]["from_prior"] > 0.99
 
 
 SWEEP = {"waveform": "chirp", "start_frequency": 20.0, "end_frequency": 500.0, "sweep_time": 0.05}

@@ -154,6 +154,15 @@ def test_a_gain_beyond_its_limits_is_warned_of_where_the_data_show_it(monkeypatc
     assert not any("the data put gain" in warning for warning in alone.warnings)
 
 
+def test_gains_that_are_impossible_together_are_no_result(monkeypatch):
+    """A factor of 1.5, as of a wrong scale, is beyond the limits of all pieces: no draw is possible."""
+    monkeypatch.setitem(session.NOISE, "I", 1e-6)
+    fit = fitact.fit(make("Vsc and I", **{"scope-8bit:A/CH2": {"gain": 0.5}}), session.scene("Vsc and I"))
+    assert fit.result == "on_bound"
+    with pytest.raises(fitact.InputError, match=r"limits of \[instrument\]"):
+        fitact.sample(fit, progress=False)
+
+
 def test_limits_keep_their_shape_in_the_quantiles(fit: fitact.Fit):
     """g is known up to the product of four uniform factors; noise is small."""
     rng = np.random.default_rng(1)
