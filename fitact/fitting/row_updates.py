@@ -5,7 +5,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from fitact.compiled import jit, pad_samples
 from fitact.data.record import Record
@@ -87,7 +87,8 @@ def _update_drive(
     if current.tones is not None:
         terms = circuit.terms[channel.channel]
         terms = terms._replace(rate=(terms.rate or 0.0) + stray)
-        noise += _missing_response(current.tones, terms, float(shift + inputs.delay), known, record)
+        used = full.samples.weights[:size] > 0.0
+        noise += _missing_response(current.tones, terms, float(shift + inputs.delay), known, used, record)
     full = set_drive(full, path, record, current.smooth, noise)
     if current.tones is not None:  # whose residuals tell nothing of the drive, and would draw a delay along
         return full
@@ -95,16 +96,26 @@ def _update_drive(
     return replace_drive(full, record, V, noise + known - respond(V, late))
 
 
-def _missing_response(tones: Tones, terms: HighpassTerms, delay: float, known: Rows, record: Record) -> Rows:
+def _missing_response(
+    tones: Tones,
+    terms: HighpassTerms,
+    delay: float,
+    known: Rows,
+    used: Bool[np.ndarray, " samples"],
+    record: Record,
+) -> Rows:
     """Return what the response to the tones of a drive has beside that to lines between its samples, which is `known`.
 
-    The latter begins at rest, and its decays are left out. The response is `delay` (s) late.
+    The latter begins at rest, and its decays are left out: those of the samples that are `used`, because the first ones
+    have the jump from rest at any time of their step, of 1e5 times the noise. The response is `delay` (s) late.
     """
     omega = tones.frequencies / record.time_step
     missing = tones.scale(jit(gain_at)(terms, omega) * np.exp(-1j * omega * delay)) - known
     since = record.time - record.time[0]
-    decays = np.array([np.ones_like(since), *(np.exp(-since / float(tau)) for tau in terms.tau)]).T
-    return missing - decays @ np.linalg.lstsq(decays, missing)[0]
+    decays = np.array([np.ones_like(since), *(np.exp(-since / float(tau)) for tau in terms.tau)])
+    functions = np.vstack([decays, tones.basis()[1:]])  # with the tones, which begin like decays
+    sizes = np.linalg.lstsq(functions[:, used].T, missing[used])[0]
+    return missing - sizes[: len(decays)] @ decays
 
 
 def _expect_harmonics(channel: ChannelLikelihood, fitted: Float[np.ndarray, " columns"]) -> np.ndarray:

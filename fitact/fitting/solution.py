@@ -12,6 +12,7 @@ from fitact.fitting.multistart import choose_start
 from fitact.fitting.row_updates import estimate_drives, update_rows
 from fitact.fitting.timing import curve_drives, shift_whole_steps, start_delays
 from fitact.likelihood import certificate
+from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import Likelihood
 from fitact.problem.build import Problem
 from fitact.problem.spectra import update_weights
@@ -85,9 +86,11 @@ def solve_problem(
             certified, failed = _certify(solved, root, reasons, tolerance)
             if not failed:
                 return solved, certified, root
-            problem, full = _replace_tables(problem._replace(likelihood=likelihood), theta, full, failed)
-            likelihood = problem.likelihood
-        elif has_rows:
+        else:  # what fits far outside a table is no optimum
+            failed = _find_outside(solved)
+        problem, full = _replace_tables(problem._replace(likelihood=likelihood), theta, full, failed)
+        likelihood = problem.likelihood
+        if has_rows and not is_settled:
             likelihood = update_rows(likelihood, solved, problem.sources)
             theta = np.where(likelihood.follows_rows, 0.0, theta)  # their delays have moved into the rows
         if steps > max_steps:
@@ -140,6 +143,13 @@ def _certify(
     certified = certificate.certify(solved.likelihood, reasons, solved.theta, root, solved.sigma, tolerance)
     pairs = enumerate(zip(solved.likelihood.channels, certified.reasons, strict=True))
     return certified, {i: why for i, (channel, why) in pairs if why and channel.compression is not None}
+
+
+def _find_outside(solved: LeastSquaresResult) -> dict[int, str]:
+    """Return the channels whose table does not reach as far as a solution, and that this is why it fails."""
+    tau = np.asarray(solved.likelihood.evaluate_circuit(solved.theta).tau)
+    tables = {i: each for i, each in enumerate(solved.likelihood.channels) if isinstance(each.compression, Compression)}
+    return {i: certificate.OUTSIDE for i, each in tables.items() if not certificate.covers(each, tau)}
 
 
 def _replace_tables(

@@ -28,6 +28,7 @@ from fitact.likelihood.projection import (
 )
 from fitact.likelihood.spectrum_observable import SpectrumObservable
 from fitact.model.circuit import HighpassTerms
+from fitact.model.divider_coordinates import differentiate, from_elements, to_elements
 from fitact.model.drive import Sampled
 from fitact.model.response_table import TABLE_HALF_WIDTH
 from fitact.model.skin import WithSkin
@@ -271,10 +272,10 @@ def certify(
 
     `covariance_factor` is a factor of the covariance of theta. The compressed log-likelihood of each channel must be
     exact to `tolerance` / (number of channels) and 1e-6 of the difference to the optimum, at the optimum, at
-    `check_points` points around it, and at almost as many points of the prior. An expansion of Student-t noise may have
-    an error `expanded_factor` times as large: an error of 0.01 moves quantiles by less than 0.01 sd. Rows of charge,
-    whose signal is up to a million times the noise of V, may have one a hundred times as large, and within the prior a
-    thousandth of the difference.
+    `check_points` points around it in `divider_coordinates`, and at almost as many points of the prior. An expansion of
+    Student-t noise may have an error `expanded_factor` times as large: an error of 0.01 moves quantiles by less than
+    0.01 sd. Rows of charge, whose signal is up to a million times the noise of V, may have one a hundred times as
+    large, and a hundredth of the difference.
     """
     channels = tuple(channel.drop_unused_columns() for channel in likelihood.channels)
     likelihood = dataclasses.replace(likelihood, channels=channels)
@@ -300,7 +301,9 @@ def certify(
     deviates = np.random.default_rng(0).standard_normal((check_points, theta.size))  # any reproducible points serve
     if likelihood.count > MANY_SAMPLES:
         check_points = math.ceil(check_points / 3)
-    around = np.vstack([theta, theta + 1.5 * deviates[:check_points] @ covariance_factor.T])
+    places = likelihood.elements
+    middle, factor = from_elements(theta, places), differentiate(theta, places) @ covariance_factor
+    around = np.vstack([theta, to_elements(middle + 1.5 * deviates[:check_points] @ factor.T, places)])
     is_local = any(channel.expansion is not None for channel in likelihood.channels)
     points = around if is_local else np.vstack([around, _prior_points(light, theta, check_points - 1)])  # fills a batch
     narrow = dataclasses.replace(likelihood, channels=restricted).without_samples()
@@ -312,14 +315,14 @@ def certify(
     differences = compressed - exact
     differences -= np.where(is_expanded, differences[0], 0.0)
     # where the density is far from normal, some of the points around the optimum are far from it in log-likelihood
-    errors = np.max((np.abs(differences) - 1e-6 * np.abs(exact - exact[0]))[: len(around)], axis=0)
+    has_rows = np.array([channel.samples.has_drive_noise for channel in likelihood.channels])
+    relative = np.where(has_rows, 1e-2, 1e-6)
+    errors = np.max((np.abs(differences) - relative * np.abs(exact - exact[0]))[: len(around)], axis=0)
     ends = [optimum.tau * np.exp(side * least_reach) for side in (-1.0, 1.0)]
     for i, channel in enumerate(likelihood.channels):
-        if not (is_expanded[i] or _is_wide(channel) or all(_covers(channel, tau) for tau in ends)):
+        if not (is_expanded[i] or _is_wide(channel) or all(covers(channel, tau) for tau in ends)):
             errors[i] = np.nan  # a wider table serves more draws
     # far from the optimum, the error may grow with the difference in log-likelihood to the optimum
-    has_rows = np.array([channel.samples.has_drive_noise for channel in likelihood.channels])
-    relative = np.where(has_rows, 1e-3, 1e-6)
     excesses = np.nanmax(np.abs(tabulated - exact) - relative * np.abs(exact[0] - exact), axis=0, initial=-np.inf)
     excesses = np.where(is_expanded, errors, excesses)
     failures = []
@@ -361,14 +364,14 @@ def _prior_points(likelihood: Likelihood, theta: np.ndarray, count: int) -> Floa
     tabulated, found = [each for each in likelihood.channels if each.compression is not None], list[np.ndarray]()
     for draw in likelihood.sample_prior(theta, 256):
         tau = np.asarray(likelihood.evaluate_circuit(draw).tau)
-        if all(_covers(each, tau) for each in tabulated):
+        if all(covers(each, tau) for each in tabulated):
             found.append(draw)
         if len(found) == count:
             break
     return np.reshape(found, (-1, theta.size))
 
 
-def _covers(channel: ChannelLikelihood, tau: Float[np.ndarray, " taus"]) -> bool:
+def covers(channel: ChannelLikelihood, tau: Float[np.ndarray, " taus"]) -> bool:
     """Return whether the table of a channel covers the time constants (s) of a circuit."""
     assert channel.compression is not None
     return bool(np.all(channel.compression.covers(tau[: tau.size - channel.electrical.lags])))

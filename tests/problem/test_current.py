@@ -320,6 +320,23 @@ def test_a_resistance_that_limits_the_current_for_some_steps(
     assert np.max(found.sd[:3]) < 0.03
 
 
+@pytest.mark.parametrize(
+    ("drive", "late"),
+    [
+        ({"waveform": "multitone", "frequencies": [100.0, 3100.0], "amplitudes": [75.0, 75.0]}, 0.3),
+        (MULTISINE, 1.4),
+    ],
+    ids=["two tones", "multisine"],
+)
+def test_tones_of_a_current_through_a_resistance(drive: dict[str, object], late: float):
+    """A made-up transient told a time constant: both were away, one by 9 standard errors, the other a misfit by 750."""
+    record = simulate_bench(drive, 14, 100e3, {"V": 0.1, "Vsc": 2e-3, "I": 100e-9}, 10e3, late=late)
+    given = bench_scene(["I"]).model_dump(exclude_unset=True) | {"grounding": {"R_H": 10e3}}
+    found = fitact.fit(record, fitact.Scene.from_dict(given))
+    assert found.trusted
+    assert np.max(np.abs(errors(found))) < 4.0
+
+
 def test_hum_does_not_stand_in_for_a_tone_of_the_drive():
     """One tone is at the frequency of the mains, and the other alone does not determine three parameters."""
     tones = {"waveform": "multitone", "frequencies": [50.0, 350.0], "amplitudes": [75.0, 75.0], "phases": [1.0, 0.3]}
