@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from fitact.blas import limit_to_one_thread
 from fitact.compiled import double_precision
@@ -24,12 +24,11 @@ from fitact.fitting.error_sources import (
 )
 from fitact.fitting.geometry import UncertainGeometry
 from fitact.fitting.laplace import Laplace
-from fitact.fitting.least_squares import LeastSquaresResult
 from fitact.fitting.minimum import Optima
 from fitact.fitting.multistart import find_optima, lower_optimum
 from fitact.fitting.residual_statistics import is_misfit, is_undersampled, pooled_statistics
 from fitact.fitting.result import Fit
-from fitact.fitting.solution import solve_problem
+from fitact.fitting.solution import Solution, solve_from_two_starts, solve_problem
 from fitact.fitting.verdict import diagnose_fit, misfit_warnings
 from fitact.likelihood import certificate
 from fitact.likelihood.likelihood import CircuitValues
@@ -116,12 +115,15 @@ def fit_records(
             if calibrated.calibration is not None:
                 likelihood = dataclasses.replace(problem.likelihood, calibration=calibrated.calibration)
                 problem = problem._replace(likelihood=likelihood)
-            solved, certified, root = solve_problem(problem, tolerance, start)
-            optima = find_optima(solved, starts) if starts > 1 else None
-            lower = None if optima is None else lower_optimum(optima, solved)
+            if start is None and starts == 1:
+                solution, several = solve_from_two_starts(problem, tolerance)
+            else:
+                solution, several = solve_problem(problem, tolerance, start), False
+            optima = find_optima(solution.solved, starts) if starts > 1 else None
+            lower = None if optima is None else lower_optimum(optima, solution.solved)
             if lower is not None:
-                solved, certified, root = solve_problem(problem, tolerance, lower)
-            return _assemble_fit(problem, solved, certified, root, optima, calibrated, without_scene=scenes[0] is None)
+                solution = solve_problem(problem, tolerance, lower)
+            return _assemble_fit(problem, solution, optima, several, calibrated, without_scene=scenes[0] is None)
         except InputError:
             raise
         except Exception as error:  # whatever it is, other records are to go on
@@ -133,29 +135,29 @@ def fit_records(
 
 def _assemble_fit(
     problem: Problem,
-    solution: LeastSquaresResult,
-    certified: certificate.CertifiedLikelihood,
-    root: Float[np.ndarray, "parameters parameters"],
+    solution: Solution,
     optima: Optima | None,
+    several: bool,
     calibrated: CalibratedInstruments,
     without_scene: bool,
 ) -> Fit:
-    likelihood, theta, sigma = certified.likelihood, solution.theta, solution.sigma
+    solved, certified, root = solution
+    likelihood, theta, sigma = certified.likelihood, solved.theta, solved.sigma
     first = problem.sources[0]
     optimum = likelihood.evaluate_circuit(theta)
     if isinstance(first.record, Spectrum):
         derive = derived.derived_from_scene(likelihood, first.scene)
     else:
         derive = derived.derived_from_fit(likelihood, first.record, first.choice, first.scene, float(optimum.b))
-    charges = solution.unknown_charges()
+    charges = solved.unknown_charges()
     log_derived = derive.log_value_and_grad(theta, charges)
     geometry = UncertainGeometry.from_scene(first.scene, derive.geometry)
     laplace = Laplace(theta, root, sigma, likelihood, derive, charges, log_derived, geometry)
     traces = tuple(
-        ChannelFit.from_optimum(solution.likelihood, i, theta, float(sigma[i]), optimum, source, certified.reasons[i])
+        ChannelFit.from_optimum(solved.likelihood, i, theta, float(sigma[i]), optimum, source, certified.reasons[i])
         for i, source in enumerate(problem.sources)
     )
-    figures = pooled_statistics([channel.figures for channel in traces]) | {"steps": solution.steps}
+    figures = pooled_statistics([channel.figures for channel in traces]) | {"steps": solved.steps}
     figures |= information_criteria(theta.size, traces)
     if optima is not None:
         figures |= {"optima": len(optima.start_counts), "starts_failed": optima.n_failed}
@@ -166,7 +168,8 @@ def _assemble_fit(
     said = _collect_remarks(problem, laplace, traces, optimum, stray, without_scene)
     tests = [check_kramers_kronig(each.record) for each in traces if isinstance(each.record, Spectrum)]
     doubts = [test.doubt for test in tests if test.doubt]
-    result, effects = diagnose_fit(solution, root, traces, optima), None
+    several = several or (optima is not None and optima.result == "several_optima")
+    result, effects = diagnose_fit(solved, root, traces, several), None
     poor = [trace for trace in traces if is_misfit(trace.figures)]
     if result == "misfit" and any(trace.channel != "Ft" for trace in poor):
         effects = assess_fit(laplace, traces, has_structure=True)
@@ -186,8 +189,8 @@ def _assemble_fit(
         compression_error=certified.error,
         experiment=experiment_from_problem(problem, likelihood, optimum, theta, sigma, charges.voltages),
         error_sources=list_error_sources(likelihood, problem.coordinates, first.scene),
-        noise_information=noise_information(likelihood, solution),
-        gain_shifts=gain_shifts(likelihood, solution, root),
+        noise_information=noise_information(likelihood, solved),
+        gain_shifts=gain_shifts(likelihood, solved, root),
         stray_changes=stray or {},
         misfit_effects=effects,
         kramers_kronig=max(tests, key=lambda test: (not test.passed, test.worst_residual), default=None),

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -14,8 +15,17 @@ from fitact.fitting.timing import curve_drives, shift_whole_steps, start_delays
 from fitact.likelihood import certificate
 from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import Likelihood
+from fitact.model.divider_coordinates import differentiate
 from fitact.problem.build import Problem
 from fitact.problem.spectra import update_weights
+
+
+class Solution(NamedTuple):
+    """Fit of a problem."""
+
+    solved: LeastSquaresResult
+    certified: certificate.CertifiedLikelihood
+    root: Float[np.ndarray, "parameters parameters"]  # factor of the covariance
 
 
 def solve_problem(
@@ -28,7 +38,7 @@ def solve_problem(
     max_steps: int = 1500,
     max_late: float = 5.0,
     max_restarts: int = 1,
-) -> tuple[LeastSquaresResult, certificate.CertifiedLikelihood, np.ndarray]:
+) -> Solution:
     """Fit, and fit again while effects of instruments for the new optimum would differ by more than `max_change`.
 
     Also after the noise of V was moved with Vsc or V was curved, while weights of spectra change by more than a
@@ -85,7 +95,7 @@ def solve_problem(
         if is_settled:
             certified, failed = _certify(solved, root, reasons, tolerance)
             if not failed:
-                return solved, certified, root
+                return Solution(solved, certified, root)
         else:  # what fits far outside a table is no optimum
             failed = _find_outside(solved)
         problem, full = _replace_tables(problem._replace(likelihood=likelihood), theta, full, failed)
@@ -106,7 +116,29 @@ def solve_problem(
         solved = _solve(problem, tolerance, full, theta)
         root = solved.covariance_factor()
         certified, failed = _certify(solved, root, reasons, tolerance)
-    return solved, certified, root
+    return Solution(solved, certified, root)
+
+
+def solve_from_two_starts(
+    problem: Problem, tolerance: float, uncertain: float = 0.2, margin: float = 3.0, separation: float = 3.0
+) -> tuple[Solution, bool]:
+    """Fit, and where log b is known to no better than `uncertain`, fit again from the skin of the prior.
+
+    The likelihood of such a record is curved, and may have another optimum. Return the better fit, and whether the
+    other one is less than a `margin` of log-density lower, and more than `separation` standard errors away.
+    """
+    found = solve_problem(problem, tolerance, None)
+    solved, root, places = found.solved, found.root, found.solved.likelihood.elements
+    if not places or np.linalg.norm((differentiate(solved.theta, places) @ root)[places[0]]) < uncertain:
+        return found, False
+    Rsc, Csc, Ci = places
+    start = problem.start.copy()
+    start[[Rsc, Csc]], start[Ci] = problem.likelihood.prior.log_mean[[Rsc, Csc]], solved.theta[Ci]
+    pair = found, solve_problem(problem._replace(start=start), tolerance, None)
+    worse, better = sorted(pair, key=lambda each: (each.solved.result == "successful", each.solved.log_density))
+    away = (worse.solved.theta - better.solved.theta)[list(places)] / np.linalg.norm(better.root, axis=1)[list(places)]
+    is_as_good = better.solved.log_density - worse.solved.log_density < margin
+    return better, worse.solved.result == "successful" and is_as_good and bool(np.max(np.abs(away)) > separation)
 
 
 def _largest_delay(solved: LeastSquaresResult) -> float:

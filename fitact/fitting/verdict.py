@@ -9,7 +9,6 @@ from jaxtyping import Float
 
 from fitact.fitting.channel_fit import ChannelFit
 from fitact.fitting.least_squares import LeastSquaresResult
-from fitact.fitting.minimum import Optima
 from fitact.fitting.residual_statistics import is_misfit
 from fitact.likelihood.likelihood import Likelihood
 from fitact.prior.product import Product
@@ -19,14 +18,14 @@ def diagnose_fit(
     solution: LeastSquaresResult,
     covariance_factor: Float[np.ndarray, "parameters parameters"],
     traces: Sequence[ChannelFit],
-    optima: Optima | None,
+    several_optima: bool,
 ) -> str:
     """Return the name of the first of the `RESULTS` that makes the fit unreliable; "successful" if none does."""
     if solution.result != "successful":
         return solution.result
     if is_out_of_bounds(solution.likelihood, solution.theta, solution.sigma, covariance_factor):
         return "on_bound"
-    if optima is not None and optima.result == "several_optima":
+    if several_optima:
         return "several_optima"
     return "misfit" if any(is_misfit(channel.figures) for channel in traces) else "successful"
 

@@ -5,6 +5,7 @@ import json
 import math
 from pathlib import Path
 
+import jax
 import numpy as np
 import pandas as pd
 import pytest
@@ -15,6 +16,8 @@ import data_synth.scene
 import fitact
 from data_synth.keys import validate_sections
 from fitact.experiment.experiment import CandidateDesign, evaluate_design
+from fitact.fitting.solution import solve_from_two_starts, solve_problem
+from fitact.problem.build import build_problem
 from fitact.problem.current import hum_likeness
 from fitact.problem.recorded_current import RecordedCurrent, estimate_noise
 from tests.conftest import RECORDS
@@ -318,6 +321,25 @@ def test_a_resistance_that_limits_the_current_for_some_steps(
     assert found.result == "successful"
     assert np.max(np.abs(errors(found))) < 4.0
     assert np.max(found.sd[:3]) < 0.03
+
+
+def test_a_local_optimum_is_left_where_the_record_leaves_the_time_constant_open():
+    """The phase of one tone is that of two time constants; that near a far start has 10 units of log-density less."""
+    sine = {"waveform": "sine", "peak_to_peak": 300.0, "frequency": 200.0}
+    record = simulate_bench(sine, 12, 100e3, {"V": 0.3, "Vsc": 2e-3, "I": 5e-7})
+    given = bench_scene(["I"]).model_dump(exclude_unset=True) | {"grounding": {"R_H": 500.0}}
+    with jax.enable_x64(True):
+        problem = build_problem((record,), (fitact.Scene.from_dict(given),))
+        problem = problem._replace(start=np.append([9.0, -19.5, -21.1], problem.start[3:]))
+        near = solve_problem(problem, 1e-3, None)
+        found, has_other = solve_from_two_starts(problem, 1e-3)
+        _, has_near = solve_from_two_starts(problem, 1e-3, margin=20.0, separation=2.0)
+    truth = np.log(list(FINGER.values()))
+    assert near.solved.result == found.solved.result == "successful"
+    assert np.max(np.abs(near.solved.theta[:3] - truth) / np.linalg.norm(near.root, axis=1)[:3]) > 4.0
+    assert np.max(np.abs(found.solved.theta[:3] - truth) / np.linalg.norm(found.root, axis=1)[:3]) < 4.0
+    assert found.solved.log_density > near.solved.log_density + 3.0
+    assert (has_other, has_near) == (False, True)  # 2.3 standard errors of the better one away
 
 
 @pytest.mark.parametrize(
