@@ -5,7 +5,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from fitact.compiled import jit, pad_samples
 from fitact.data.record import Record
@@ -18,7 +18,7 @@ from fitact.likelihood.charge_rows import MAX_STEPS, ChargeRows
 from fitact.likelihood.compression import HUM_FREQUENCIES
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.observable import ChannelInputs
-from fitact.model.circuit import HighpassTerms, gain_at
+from fitact.model.circuit import gain_at
 from fitact.model.drive import Sampled
 from fitact.problem.limited_current import NoisePath, estimate_drive, replace_drive, set_drive
 from fitact.problem.recorded_current import Current, RecordedCurrent, set_rows
@@ -54,7 +54,7 @@ def update_rows(likelihood: Likelihood, solution: LeastSquaresResult, sources: S
             sigma, record = np.asarray(solution.sigma[i]), sources[i].in_time
             if channel.samples.charges is None:
                 delay = inputs.delay + (solved.timing.shift - channel.timing.shift)
-                inputs = dataclasses.replace(inputs, delay=delay)
+                inputs = _correct_delay(channel, dataclasses.replace(inputs, delay=delay), optimum, record)
                 channel = _update_drive(channel, inputs, sigma, optimum, record)
             else:
                 beta = np.asarray(compiled_fit_nuisances(solved, inputs, sigma)[1])
@@ -85,10 +85,8 @@ def _update_drive(
     path = NoisePath.from_terms(circuit.terms[channel.channel], stray, step)
     known = respond(current.smooth, late)
     if current.tones is not None:
-        terms = circuit.terms[channel.channel]
-        terms = terms._replace(rate=(terms.rate or 0.0) + stray)
-        used = full.samples.weights[:size] > 0.0
-        noise += _missing_response(current.tones, terms, float(shift + inputs.delay), known, used, record)
+        response, _ = _respond_to_tones(current.tones, channel, inputs, circuit, record)
+        noise += _leave_out_decays(response - known, full, current.tones, circuit, record)
     full = set_drive(full, path, record, current.smooth, noise)
     if current.tones is not None:  # whose residuals tell nothing of the drive, and would draw a delay along
         return full
@@ -96,23 +94,44 @@ def _update_drive(
     return replace_drive(full, record, V, noise + known - respond(V, late))
 
 
-def _missing_response(
-    tones: Tones,
-    terms: HighpassTerms,
-    delay: float,
-    known: Rows,
-    used: Bool[np.ndarray, " samples"],
-    record: Record,
-) -> Rows:
-    """Return what the response to the tones of a drive has beside that to lines between its samples, which is `known`.
+def _respond_to_tones(
+    tones: Tones, channel: ChannelLikelihood, inputs: ChannelInputs, circuit: CircuitValues, record: Record
+) -> tuple[Rows, Rows]:
+    """Return the steady response of a current to the tones of a drive (A), and its derivative by the delay (A/s)."""
+    terms = circuit.terms[channel.channel]
+    terms = terms._replace(rate=(terms.rate or 0.0) + float(inputs.stray or 0.0))
+    omega, delay = tones.frequencies / record.time_step, float(channel.timing.shift + inputs.delay)
+    gain = jit(gain_at)(terms, omega) * np.exp(-1j * omega * delay)
+    return tones.scale(gain), tones.scale(-1j * omega * gain)
 
-    The latter begins at rest, and its decays are left out: those of the samples that are `used`, because the first ones
-    have the jump from rest at any time of their step, of 1e5 times the noise. The response is `delay` (s) late.
+
+def _correct_delay(
+    channel: ChannelLikelihood, inputs: ChannelInputs, circuit: CircuitValues, record: Record
+) -> ChannelInputs:
+    """Return inputs with the delay at which a current of tones responds as the channel does with these.
+
+    What lines between the samples lack was added for another delay, and does not follow it, which may be half of all.
     """
-    omega = tones.frequencies / record.time_step
-    missing = tones.scale(jit(gain_at)(terms, omega) * np.exp(-1j * omega * delay)) - known
-    since = record.time - record.time[0]
-    decays = np.array([np.ones_like(since), *(np.exp(-since / float(tau)) for tau in terms.tau)])
+    tones, full = RecordedCurrent.from_record(record).tones, channel.without_compression()
+    if tones is None:
+        return inputs
+    modelled = np.asarray(compiled_signal(full, dataclasses.replace(inputs, gain=np.ones(()))))[: len(record)]
+    response, slope = _respond_to_tones(tones, channel, inputs, circuit, record)
+    slope = slope * (full.samples.weights[: len(record)] > 0.0)
+    return dataclasses.replace(inputs, delay=inputs.delay + slope @ (modelled - response) / (slope @ slope))
+
+
+def _leave_out_decays(
+    missing: Rows, channel: ChannelLikelihood, tones: Tones, circuit: CircuitValues, record: Record
+) -> Rows:
+    """Return what the response to lines between the samples of tones lacks, without the decays of a start from rest.
+
+    They are those of the samples that are used, because the first ones have the jump from rest at any time of their
+    step, of 1e5 times the noise.
+    """
+    since, used = record.time - record.time[0], channel.samples.weights[: len(record)] > 0.0
+    taus = np.asarray(circuit.terms[channel.channel].tau, dtype=float)
+    decays = np.vstack([np.ones_like(since), np.exp(-since / taus[:, None])])
     functions = np.vstack([decays, tones.basis()[1:]])  # with the tones, which begin like decays
     sizes = np.linalg.lstsq(functions[:, used].T, missing[used])[0]
     return missing - sizes[: len(decays)] @ decays

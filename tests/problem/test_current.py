@@ -252,6 +252,19 @@ def test_vsc_and_a_current_through_a_resistance(drive: dict[str, object], rate: 
     assert found.parameters()["Ci"]["u"] < 1e-3
 
 
+def test_tones_of_a_current_settle_at_their_delay():
+    """The part that lines lack stayed at its delay, so that the fit went to and fro between -0.1 and 0.3 steps."""
+    slow = MULTISINE | {"frequencies": [100.0 * n for n in range(1, 40, 2)]}
+    record = simulate_bench(slow, 14, 200e3, {"V": 0.1, "Vsc": 3e-3, "I": 40e-9}, 2000.0, late=0.1)
+    given = bench_scene(["Vsc", "I"]).model_dump(exclude_unset=True) | {"grounding": {"R_H": 2000.0}}
+    found = fitact.fit(record, fitact.Scene.from_dict(given))
+    assert found.trusted
+    assert np.max(np.abs(errors(found))) < 4.0
+    place = found.names.index("delay_I")
+    assert found.theta[place] == pytest.approx(0.1, abs=4.0 * found.sd[place])
+    assert found.sd[place] < 0.01
+
+
 @pytest.mark.parametrize("given", [None, scene(["I"])], ids=["no scene", "no Ci"])
 def test_a_current_tells_a_Ci_that_nobody_stated(given: fitact.Scene | None):
     """Half of the reference paper's, which was assumed to 5 %, so that the answer was 40 u away."""
