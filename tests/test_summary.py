@@ -5,7 +5,7 @@ import scipy.stats
 
 import fitact
 from fitact import summary
-from fitact.fitting.minimum import RESULT_NAMES
+from fitact.fitting.outcome import RESULT_NAMES
 from fitact.result_text import quantity_table
 from fitact.summary import format_estimate, format_interval, summarize_normal
 from fitact.what_now import advice_sections, explain

@@ -24,11 +24,9 @@ from fitact.fitting.error_sources import (
 )
 from fitact.fitting.geometry import UncertainGeometry
 from fitact.fitting.laplace import Laplace
-from fitact.fitting.minimum import Optima
-from fitact.fitting.multistart import find_optima, lower_optimum
+from fitact.fitting.multistart import Optima, fit_from_starts
 from fitact.fitting.residual_statistics import is_misfit, is_undersampled, pooled_statistics
 from fitact.fitting.result import Fit
-from fitact.fitting.solution import Solution, solve_from_two_starts, solve_problem
 from fitact.fitting.verdict import diagnose_fit, misfit_warnings
 from fitact.likelihood import certificate
 from fitact.likelihood.likelihood import CircuitValues
@@ -115,15 +113,10 @@ def fit_records(
             if calibrated.calibration is not None:
                 likelihood = dataclasses.replace(problem.likelihood, calibration=calibrated.calibration)
                 problem = problem._replace(likelihood=likelihood)
-            if start is None and starts == 1:
-                solution, several = solve_from_two_starts(problem, tolerance)
-            else:
-                solution, several = solve_problem(problem, tolerance, start), False
-            optima = find_optima(solution.solved, starts) if starts > 1 else None
-            lower = None if optima is None else lower_optimum(optima, solution.solved)
-            if lower is not None:
-                solution = solve_problem(problem, tolerance, lower)
-            return _assemble_fit(problem, solution, optima, several, calibrated, without_scene=scenes[0] is None)
+            optima = fit_from_starts(problem, tolerance, start, starts)
+            found = _assemble_fit(problem, optima, calibrated, without_scene=scenes[0] is None)
+            figures = {"optima": optima.distinct, "starts_failed": optima.failed} if starts > 1 else {}
+            return dataclasses.replace(found, figures=found.figures | figures)
         except InputError:
             raise
         except Exception as error:  # whatever it is, other records are to go on
@@ -133,15 +126,8 @@ def fit_records(
             ) from error
 
 
-def _assemble_fit(
-    problem: Problem,
-    solution: Solution,
-    optima: Optima | None,
-    several: bool,
-    calibrated: CalibratedInstruments,
-    without_scene: bool,
-) -> Fit:
-    solved, certified, root = solution
+def _assemble_fit(problem: Problem, optima: Optima, calibrated: CalibratedInstruments, without_scene: bool) -> Fit:
+    solved, certified, root = optima.best
     likelihood, theta, sigma = certified.likelihood, solved.theta, solved.sigma
     first = problem.sources[0]
     optimum = likelihood.evaluate_circuit(theta)
@@ -159,8 +145,6 @@ def _assemble_fit(
     )
     figures = pooled_statistics([channel.figures for channel in traces]) | {"steps": solved.steps}
     figures |= information_criteria(theta.size, traces)
-    if optima is not None:
-        figures |= {"optima": len(optima.start_counts), "starts_failed": optima.n_failed}
     channels = [trace.channel for trace in traces]
     stray = None
     if remarks.has_unstated_stray(problem.sources, channels):
@@ -168,8 +152,7 @@ def _assemble_fit(
     said = _collect_remarks(problem, laplace, traces, optimum, stray, without_scene)
     tests = [check_kramers_kronig(each.record) for each in traces if isinstance(each.record, Spectrum)]
     doubts = [test.doubt for test in tests if test.doubt]
-    several = several or (optima is not None and optima.result == "several_optima")
-    result, effects = diagnose_fit(solved, root, traces, several), None
+    result, effects = diagnose_fit(solved, root, traces, optima.has_rival), None
     poor = [trace for trace in traces if is_misfit(trace.figures)]
     if result == "misfit" and any(trace.channel != "Ft" for trace in poor):
         effects = assess_fit(laplace, traces, has_structure=True)

@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 from fitact.compiled import jit
 from fitact.experiment.fisher import covariance_factor
 from fitact.fitting.derived import UnknownCharges
-from fitact.fitting.minimum import minimise, result_name
+from fitact.fitting.minimum import minimise
+from fitact.fitting.outcome import result_name
 from fitact.fitting.score_test import explained_squares
 from fitact.fitting.timing import clock_r_squared, free_timing
 from fitact.likelihood.certificate import can_interpolate, expand_student, interpolate_channel, recompress

@@ -1,68 +1,87 @@
-"""Least squares from several starting points, which shows whether there are other optima."""
+"""Fits from several starting points, which show whether there are other optima."""
 
-import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
-import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from fitact.errors import InputError
-from fitact.fitting.least_squares import LeastSquaresResult, solve
-from fitact.fitting.minimum import Optima, minimise_many
-from fitact.likelihood.likelihood import Likelihood
+from fitact.fitting.solution import Solution, solve_problem
+from fitact.model.divider_coordinates import differentiate
 from fitact.problem.build import Problem
-from fitact.problem.starting_point import residual_objective
 
 
-def choose_start(problem: Problem, start: Mapping[str, float] | None) -> Float[np.ndarray, " parameters"]:
-    """Return the starting point estimated from the data, or one fitted to the samples from `start` (SI units).
+class Optima(NamedTuple):
+    """Fits from several starting points."""
 
-    The response table covers only the neighbourhood of the data's start, so another start is first fitted to the
-    samples. Far from the data the circuit gives no signal and that fit fails; if it ends above the data's start, the
-    latter is returned.
+    best: Solution  # the most probable of those that converged, if any did
+    distinct: int  # number of optima that differ
+    failed: int  # number of starts that did not converge
+    has_rival: bool  # whether another optimum is almost as probable
 
-    Raises:
-        InputError: a name is not a free parameter, or a value is not positive and finite.
+
+def fit_from_starts(problem: Problem, tolerance: float, start: Mapping[str, float] | None, count: int) -> Optima:
+    """Fit from `start`, and from draws of the prior, `count` points in all.
+
+    One fit from the data's start is followed by another one from the skin of the prior if it leaves b open: the
+    likelihood of such a record is curved, and may have another optimum. That counts if the standard errors do not cover
+    it; where several starts are asked for, any other optimum does.
     """
-    theta, names = problem.start.copy(), problem.likelihood.prior.names
-    if start is None:
-        return theta
-    for name, value in start.items():
-        if name not in names or not 0.0 < value < math.inf:
-            raise InputError(f"start {name} = {value}: give positive values in SI units for any of {', '.join(names)}")
-        theta[names.index(name)] = math.log(value)
-    noise = np.array([source.noise for source in problem.sources])
-    end = solve(problem.likelihood, theta, noise, ((),) * noise.size, (False,) * noise.size).theta
-    objective_end, objective_start = residual_objective(problem.likelihood, np.stack([end, problem.start]))
-    return end if objective_end < objective_start else problem.start
+    first = solve_problem(problem, tolerance, start)
+    others: list[np.ndarray] = []
+    if count > 1:
+        others = list(_draw_starts(first, count - 1))
+    elif start is None and _leaves_b_open(first):
+        others = [_start_at_prior(problem, first)]
+    found = [first, *(solve_problem(problem._replace(start=each), tolerance, None) for each in others)]
+    return compare_optima(found, separation=0.2 if count > 1 else 3.0)
 
 
-def find_optima(solution: LeastSquaresResult, count: int, draws_per_start: int = 100) -> Optima:
-    """Return the optima reached from the solution and `count` - 1 draws of the prior, at the noise of the solution.
+def compare_optima(found: Sequence[Solution], separation: float, margin: float = 3.0) -> Optima:
+    """Choose among fits of one problem, and count distinct optima.
 
-    If the record is compressed, only draws with a time constant within its table are used. These may be few, so
-    `draws_per_start` draws are made for each start.
+    They are distinct if a parameter differs by more than `separation` standard errors of the better one. A rival has a
+    log-density lower by a `margin` at most.
     """
-    likelihood = solution.likelihood.without_samples()
-    draws = likelihood.sample_prior(solution.theta, draws_per_start * count)
+    converged = [each for each in found if each.solved.result in ("successful", "rank_deficient")]
+    ordered = sorted(converged or found, key=lambda each: -each.solved.log_density)
+    distinct = ordered[:1]
+    for each in ordered[1:]:
+        if all(_distance(each, other) > separation for other in distinct):
+            distinct.append(each)
+    best, *others = distinct
+    has_rival = any(best.solved.log_density - each.solved.log_density < margin for each in others)
+    return Optima(best, len(distinct), len(found) - len(converged), has_rival)
+
+
+def _distance(one: Solution, other: Solution) -> float:
+    """Return the largest distance of a parameter between two fits, in standard errors of the `other`."""
+    size = len(other.solved.likelihood.prior.names)
+    away = one.solved.theta[:size] - other.solved.theta[:size]
+    return float(np.max(np.abs(away) / np.linalg.norm(other.root[:size], axis=1)))
+
+
+def _leaves_b_open(found: Solution, least_sd: float = 0.2) -> bool:
+    """Return whether log b is uncertain by `least_sd` or more."""
+    theta, places = found.solved.theta, found.solved.likelihood.elements
+    return bool(places) and bool(np.linalg.norm((differentiate(theta, places) @ found.root)[places[0]]) > least_sd)
+
+
+def _start_at_prior(problem: Problem, found: Solution) -> Float[np.ndarray, " circuit_parameters"]:
+    """Return the start of a problem with the Rsc and Csc of the prior, and the fitted Ci."""
+    Rsc, Csc, Ci = found.solved.likelihood.elements
+    start = problem.start.copy()
+    start[[Rsc, Csc]], start[Ci] = problem.likelihood.prior.log_mean[[Rsc, Csc]], found.solved.theta[Ci]
+    return start
+
+
+def _draw_starts(
+    found: Solution, count: int, draws_per_start: int = 100
+) -> Float[np.ndarray, "starts circuit_parameters"]:
+    """Return `count` draws of the prior whose time constant the tables of a fit cover, or as many as there are."""
+    likelihood = found.solved.likelihood.without_samples()
+    draws = likelihood.sample_prior(found.solved.theta, draws_per_start * (count + 1))
     _, slowest = likelihood.evaluate_g_and_b(draws)
     tables = [channel.compression for channel in likelihood.channels if channel.compression is not None]
-    within_tables = np.all([np.ones(len(draws), bool), *(table.covers(slowest) for table in tables)], axis=0)
-    starts = np.vstack([solution.theta, draws[within_tables][: count - 1]])
-    return minimise_many(jax.tree_util.Partial(_residuals, likelihood, solution.sigma), starts, likelihood.elements)
-
-
-def _residuals(
-    likelihood: Likelihood, sigma: Float[Array, " channels"], theta: Float[Array, " parameters"]
-) -> tuple[tuple[Array, ...], Array]:
-    return likelihood.residuals(theta, sigma), likelihood.prior_residuals(theta)
-
-
-def lower_optimum(optima: Optima, solution: LeastSquaresResult, min_separation: float = 0.5) -> dict[str, float] | None:
-    """Return the parameters (SI) of a lower optimum at least `min_separation` standard errors away, or None."""
-    lowest = optima.minima.theta[0]
-    separation = np.linalg.norm(optima.minima.jacobian[0] @ (solution.theta - lowest))
-    if not separation > min_separation:
-        return None
-    return {name: math.exp(lowest[i]) for i, name in enumerate(solution.likelihood.prior.names)}
+    within = np.all([np.ones(len(draws), bool), *(table.covers(slowest) for table in tables)], axis=0)
+    return draws[within][:count, : len(likelihood.prior.names)]

@@ -7,17 +7,17 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from fitact.errors import InputError
 from fitact.fitting.instrument_effects import effects_would_change, fill_effects
 from fitact.fitting.least_squares import LeastSquaresResult, solve
-from fitact.fitting.multistart import choose_start
 from fitact.fitting.row_updates import estimate_drives, update_rows
 from fitact.fitting.timing import curve_drives, shift_whole_steps, start_delays
 from fitact.likelihood import certificate
 from fitact.likelihood.compression import Compression
 from fitact.likelihood.likelihood import Likelihood
-from fitact.model.divider_coordinates import differentiate
 from fitact.problem.build import Problem
 from fitact.problem.spectra import update_weights
+from fitact.problem.starting_point import residual_objective
 
 
 class Solution(NamedTuple):
@@ -55,7 +55,7 @@ def solve_problem(
     `max_restarts` times.
     """
     first = problem
-    noise, theta = [source.noise for source in problem.sources], choose_start(problem, start)
+    noise, theta = [source.noise for source in problem.sources], _choose_start(problem, start)
     likelihood, best, best_rank, steps = problem.likelihood, None, (False, -math.inf), 0
     likelihood = estimate_drives(likelihood, theta, problem.sources)
     full: dict[int, str] = {}  # channels whose table has failed, and why
@@ -119,26 +119,27 @@ def solve_problem(
     return Solution(solved, certified, root)
 
 
-def solve_from_two_starts(
-    problem: Problem, tolerance: float, uncertain: float = 0.2, margin: float = 3.0, separation: float = 3.0
-) -> tuple[Solution, bool]:
-    """Fit, and where log b is known to no better than `uncertain`, fit again from the skin of the prior.
+def _choose_start(problem: Problem, start: Mapping[str, float] | None) -> Float[np.ndarray, " parameters"]:
+    """Return the starting point estimated from the data, or one fitted to the samples from `start` (SI units).
 
-    The likelihood of such a record is curved, and may have another optimum. Return the better fit, and whether the
-    other one is less than a `margin` of log-density lower, and more than `separation` standard errors away.
+    The response table covers only the neighbourhood of the data's start, so another start is first fitted to the
+    samples. Far from the data the circuit gives no signal and that fit fails; if it ends above the data's start, the
+    latter is returned.
+
+    Raises:
+        InputError: a name is not a free parameter, or a value is not positive and finite.
     """
-    found = solve_problem(problem, tolerance, None)
-    solved, root, places = found.solved, found.root, found.solved.likelihood.elements
-    if not places or np.linalg.norm((differentiate(solved.theta, places) @ root)[places[0]]) < uncertain:
-        return found, False
-    Rsc, Csc, Ci = places
-    start = problem.start.copy()
-    start[[Rsc, Csc]], start[Ci] = problem.likelihood.prior.log_mean[[Rsc, Csc]], solved.theta[Ci]
-    pair = found, solve_problem(problem._replace(start=start), tolerance, None)
-    worse, better = sorted(pair, key=lambda each: (each.solved.result == "successful", each.solved.log_density))
-    away = (worse.solved.theta - better.solved.theta)[list(places)] / np.linalg.norm(better.root, axis=1)[list(places)]
-    is_as_good = better.solved.log_density - worse.solved.log_density < margin
-    return better, worse.solved.result == "successful" and is_as_good and bool(np.max(np.abs(away)) > separation)
+    theta, names = problem.start.copy(), problem.likelihood.prior.names
+    if start is None:
+        return theta
+    for name, value in start.items():
+        if name not in names or not 0.0 < value < math.inf:
+            raise InputError(f"start {name} = {value}: give positive values in SI units for any of {', '.join(names)}")
+        theta[names.index(name)] = math.log(value)
+    noise = np.array([source.noise for source in problem.sources])
+    end = solve(problem.likelihood, theta, noise, ((),) * noise.size, (False,) * noise.size).theta
+    objective_end, objective_start = residual_objective(problem.likelihood, np.stack([end, problem.start]))
+    return end if objective_end < objective_start else problem.start
 
 
 def _largest_delay(solved: LeastSquaresResult) -> float:

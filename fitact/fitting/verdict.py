@@ -18,14 +18,14 @@ def diagnose_fit(
     solution: LeastSquaresResult,
     covariance_factor: Float[np.ndarray, "parameters parameters"],
     traces: Sequence[ChannelFit],
-    several_optima: bool,
+    has_rival: bool,
 ) -> str:
     """Return the name of the first of the `RESULTS` that makes the fit unreliable; "successful" if none does."""
     if solution.result != "successful":
         return solution.result
     if is_out_of_bounds(solution.likelihood, solution.theta, solution.sigma, covariance_factor):
         return "on_bound"
-    if several_optima:
+    if has_rival:
         return "several_optima"
     return "misfit" if any(is_misfit(channel.figures) for channel in traces) else "successful"
 

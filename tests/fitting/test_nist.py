@@ -14,6 +14,7 @@ import pytest
 from jax import Array
 
 from fitact.fitting import minimum
+from fitact.fitting.outcome import result_name
 
 DATA = Path(__file__).parents[1] / "nist_strd"
 
@@ -134,7 +135,7 @@ QUICK = {"Misra1a", "Chwirut2", "Lanczos3", "Gauss1", "MGH09", "Thurber", "BoxBO
 )
 def test_certified_values(name: str, start: int):
     problem, ends = solved(name)
-    assert minimum.result_name(jax.tree.map(lambda leaf: leaf[start], ends.result)) == "successful"
+    assert result_name(jax.tree.map(lambda leaf: leaf[start], ends.result)) == "successful"
     assert digits(np.asarray(ends.theta)[start], problem.values) >= 6.0
     # the residuals of Lanczos1 are rounding errors of its data and of double precision
     if name != "Lanczos1":

@@ -13,7 +13,7 @@ from jax import Array
 
 import fitact
 from fitact.fitting import minimum
-from fitact.fitting.minimum import result_name
+from fitact.fitting.outcome import result_name
 from fitact.likelihood.likelihood import Likelihood
 
 TIME = np.linspace(0.0, 3.0, 40)
@@ -136,35 +136,6 @@ def test_no_step_helps():
 def test_out_of_steps():
     end = minimum.minimise(decay, jnp.array([1.0, 0.3]), max_steps=3)
     assert result_name(end.result) == "nonlinear_max_steps_reached"
-
-
-def two_wells(x: Array, tilt: float) -> Array:
-    """Cost with minima near -3 and +3, whose values differ by about 3 tilt."""
-    return jnp.array([x[0] ** 2 - 9.0, jnp.sqrt(2.0 * (10.0 + 0.5 * tilt * x[0]))])
-
-
-@pytest.mark.parametrize(("tilt", "result"), [(0.1, "several_optima"), (2.0, "successful")])
-def test_several_optima_only_where_they_are_of_like_height(tilt: float, result: str):
-    starts = np.linspace(-8.0, 8.0, 16)[:, None]
-    optima = minimum.minimise_many(functools.partial(two_wells, tilt=tilt), starts)
-    cubic = np.polynomial.Polynomial([0.5 * tilt, -18.0, 0.0, 2.0]).roots()  # derivative of the cost
-    np.testing.assert_allclose(optima.minima.theta[:, 0], cubic[[0, 2]], rtol=1e-6)
-    assert optima.result == result
-    assert sum(optima.start_counts) + optima.n_failed == 16
-    assert min(optima.start_counts) > 5
-
-
-def test_a_ridge_is_one_optimum():
-    starts = np.random.default_rng(1).uniform(-2.0, 2.0, (8, 2))
-    optima = minimum.minimise_many(lambda theta: 100.0 * (jnp.exp(theta[0] + theta[1]) - jnp.array([0.9, 1.1])), starts)
-    assert optima.result == "rank_deficient"
-    assert optima.n_failed == 0
-    np.testing.assert_array_equal(optima.start_counts, [8])
-
-
-def test_no_start_leads_to_an_optimum():
-    optima = minimum.minimise_many(lambda theta: 1.0 + jnp.exp(-theta), np.array([[0.0], [1.0]]))
-    assert optima.result not in ("successful", "several_optima")
 
 
 @pytest.fixture

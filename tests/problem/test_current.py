@@ -16,7 +16,8 @@ import data_synth.scene
 import fitact
 from data_synth.keys import validate_sections
 from fitact.experiment.experiment import CandidateDesign, evaluate_design
-from fitact.fitting.solution import solve_from_two_starts, solve_problem
+from fitact.fitting.multistart import compare_optima, fit_from_starts
+from fitact.fitting.solution import solve_problem
 from fitact.problem.build import build_problem
 from fitact.problem.current import hum_likeness
 from fitact.problem.recorded_current import RecordedCurrent, estimate_noise
@@ -345,14 +346,15 @@ def test_a_local_optimum_is_left_where_the_record_leaves_the_time_constant_open(
         problem = build_problem((record,), (fitact.Scene.from_dict(given),))
         problem = problem._replace(start=np.append([9.0, -19.5, -21.1], problem.start[3:]))
         near = solve_problem(problem, 1e-3, None)
-        found, has_other = solve_from_two_starts(problem, 1e-3)
-        _, has_near = solve_from_two_starts(problem, 1e-3, margin=20.0, separation=2.0)
+        optima = fit_from_starts(problem, 1e-3, None, 1)
+    found = optima.best
     truth = np.log(list(FINGER.values()))
     assert near.solved.result == found.solved.result == "successful"
     assert np.max(np.abs(near.solved.theta[:3] - truth) / np.linalg.norm(near.root, axis=1)[:3]) > 4.0
     assert np.max(np.abs(found.solved.theta[:3] - truth) / np.linalg.norm(found.root, axis=1)[:3]) < 4.0
     assert found.solved.log_density > near.solved.log_density + 3.0
-    assert (has_other, has_near) == (False, True)  # 2.3 standard errors of the better one away
+    assert not optima.has_rival
+    assert compare_optima([near, found], 2.0, margin=20.0).has_rival  # 2.3 standard errors away
 
 
 @pytest.mark.parametrize(
