@@ -30,7 +30,7 @@ def fit_from_starts(problem: Problem, tolerance: float, start: Mapping[str, floa
     first = solve_problem(problem, tolerance, start)
     others: list[np.ndarray] = []
     if count > 1:
-        others = list(_draw_starts(first, count - 1))
+        others = _draw_starts(problem, first, count - 1)
     elif start is None and _leaves_b_open(first):
         others = [_start_at_prior(problem, first)]
     found = [first, *(solve_problem(problem._replace(start=each), tolerance, None) for each in others)]
@@ -76,12 +76,12 @@ def _start_at_prior(problem: Problem, found: Solution) -> Float[np.ndarray, " ci
 
 
 def _draw_starts(
-    found: Solution, count: int, draws_per_start: int = 100
-) -> Float[np.ndarray, "starts circuit_parameters"]:
+    problem: Problem, found: Solution, count: int, draws_per_start: int = 100
+) -> list[Float[np.ndarray, " circuit_parameters"]]:
     """Return `count` draws of the prior whose time constant the tables of a fit cover, or as many as there are."""
-    likelihood = found.solved.likelihood.without_samples()
+    likelihood, size = found.solved.likelihood.without_samples(), len(problem.likelihood.prior.names)
     draws = likelihood.sample_prior(found.solved.theta, draws_per_start * (count + 1))
     _, slowest = likelihood.evaluate_g_and_b(draws)
     tables = [channel.compression for channel in likelihood.channels if channel.compression is not None]
     within = np.all([np.ones(len(draws), bool), *(table.covers(slowest) for table in tables)], axis=0)
-    return draws[within][:count, : len(likelihood.prior.names)]
+    return [np.append(draw[:size], problem.start[size:]) for draw in draws[within][:count]]

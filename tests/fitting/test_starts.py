@@ -99,6 +99,13 @@ def test_one_optimum_from_many_starts(fit: fitact.Fit):
     assert np.all(np.abs(found.theta - fit.theta) < 1e-4 * fit.sd)
 
 
+def test_starts_with_a_delay(finger_fit: fitact.Fit):
+    """A delay against the recorded V is free in each."""
+    found = fitact.fit(finger_fit.record, finger_fit.scene, starts=3)
+    assert found.figures["optima"] == 1
+    assert np.all(np.abs(found.theta - finger_fit.theta) < 1e-2 * finger_fit.sd)
+
+
 @pytest.mark.slow
 def test_the_current_alone_cannot_tell_which_skin_is_which():
     """The admittance does not change if the two skins are exchanged, and their priors are equal."""
