@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.fitting.solution import Solution, solve_problem
+from fitact.likelihood.certificate import draw_within_tables
 from fitact.model.divider_coordinates import differentiate
 from fitact.problem.build import Problem
 
@@ -37,16 +38,19 @@ def fit_from_starts(problem: Problem, tolerance: float, start: Mapping[str, floa
     return compare_optima(found, separation=0.2 if count > 1 else 3.0)
 
 
-def compare_optima(found: Sequence[Solution], separation: float, margin: float = 3.0) -> Optima:
-    """Choose among fits of one problem, and count distinct optima.
+def compare_optima(found: Sequence[Solution], separation: float, margin: float = 3.0, rounding: float = 1e-3) -> Optima:
+    """Choose the most probable among fits of one problem, and count distinct optima.
 
-    They are distinct if a parameter differs by more than `separation` standard errors of the better one. A rival has a
-    log-density lower by a `margin` at most.
+    Of fits whose log-densities differ by a `rounding` at most, the first is chosen. Two are distinct if a parameter
+    differs by more than `separation` standard errors of the better one. A rival has a log-density lower by a `margin`
+    at most.
     """
     converged = [each for each in found if each.solved.result in ("successful", "rank_deficient")]
-    ordered = sorted(converged or found, key=lambda each: -each.solved.log_density)
-    distinct = ordered[:1]
-    for each in ordered[1:]:
+    candidates = converged or found
+    highest = max(each.solved.log_density for each in candidates)
+    # also where the log-density is not a number
+    distinct = [next(each for each in candidates if not each.solved.log_density < highest - rounding)]
+    for each in sorted(candidates, key=lambda each: -each.solved.log_density):
         if all(_distance(each, other) > separation for other in distinct):
             distinct.append(each)
     best, *others = distinct
@@ -75,13 +79,8 @@ def _start_at_prior(problem: Problem, found: Solution) -> Float[np.ndarray, " ci
     return start
 
 
-def _draw_starts(
-    problem: Problem, found: Solution, count: int, draws_per_start: int = 100
-) -> list[Float[np.ndarray, " circuit_parameters"]]:
-    """Return `count` draws of the prior whose time constant the tables of a fit cover, or as many as there are."""
+def _draw_starts(problem: Problem, found: Solution, count: int) -> list[Float[np.ndarray, " circuit_parameters"]]:
+    """Return `count` draws of the prior that the tables of a fit cover, or as many as a hundred times as many hold."""
     likelihood, size = found.solved.likelihood.without_samples(), len(problem.likelihood.prior.names)
-    draws = likelihood.sample_prior(found.solved.theta, draws_per_start * (count + 1))
-    _, slowest = likelihood.evaluate_g_and_b(draws)
-    tables = [channel.compression for channel in likelihood.channels if channel.compression is not None]
-    within = np.all([np.ones(len(draws), bool), *(table.covers(slowest) for table in tables)], axis=0)
-    return [np.append(draw[:size], problem.start[size:]) for draw in draws[within][:count]]
+    draws = draw_within_tables(likelihood, found.solved.theta, count, draws=100 * (count + 1))
+    return [np.append(draw[:size], problem.start[size:]) for draw in draws]

@@ -36,7 +36,7 @@ def is_out_of_bounds(
     sigma: Float[np.ndarray, " channels"],
     covariance_factor: Float[np.ndarray, "parameters parameters"],
     blind: float = 6.0,
-    noise: float = 5.0,
+    noise: float = 4.0,
 ) -> bool:
     """Return whether the data put the parameters where a bounded or ordered prior, or an instrument, forbids them.
 

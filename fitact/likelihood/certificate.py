@@ -305,7 +305,9 @@ def certify(
     middle, factor = from_elements(theta, places), differentiate(theta, places) @ covariance_factor
     around = np.vstack([theta, to_elements(middle + 1.5 * deviates[:check_points] @ factor.T, places)])
     is_local = any(channel.expansion is not None for channel in likelihood.channels)
-    points = around if is_local else np.vstack([around, _prior_points(light, theta, check_points - 1)])  # fills a batch
+    points = (
+        around if is_local else np.vstack([around, draw_within_tables(light, theta, check_points - 1)])
+    )  # fills a batch
     narrow = dataclasses.replace(likelihood, channels=restricted).without_samples()
     exact, compressed, tabulated = _evaluate_log_likelihoods(
         (likelihood.without_compression(), narrow, light), points, sigma
@@ -359,10 +361,12 @@ def _compression_failure(error: float, excess: float, tolerance: float) -> str:
     return f"the error of the compressed log-likelihood is {excess:.2g} within the prior" if excess > tolerance else ""
 
 
-def _prior_points(likelihood: Likelihood, theta: np.ndarray, count: int) -> Float[np.ndarray, "n parameters"]:
-    """Return draws from the prior that the tables cover, `count` if there are so many."""
+def draw_within_tables(
+    likelihood: Likelihood, theta: np.ndarray, count: int, draws: int = 256
+) -> Float[np.ndarray, "n parameters"]:
+    """Return draws from the prior that the tables cover, `count` if so many of the `draws` are."""
     tabulated, found = [each for each in likelihood.channels if each.compression is not None], list[np.ndarray]()
-    for draw in likelihood.sample_prior(theta, 256):
+    for draw in likelihood.sample_prior(theta, draws):
         tau = np.asarray(likelihood.evaluate_circuit(draw).tau)
         if all(covers(each, tau) for each in tabulated):
             found.append(draw)
