@@ -19,7 +19,8 @@ from jaxtyping import Bool, Float, Int
 from fitact.batch.gauss_newton import CANDIDATES, GaussNewton, GaussNewtonResult, RecordInputs
 from fitact.compiled import empty_aligned
 from fitact.data.clipping import clipping_mask
-from fitact.data.record import Record, white_noise_sds
+from fitact.data.noise import white_noise_sds
+from fitact.data.record import Record
 from fitact.fitting.derived import DerivedQuantities
 from fitact.fitting.least_squares import MIN_BIC_DECREASE, NUISANCES, bic_decrease
 from fitact.fitting.residual_statistics import is_misfit, residual_statistics

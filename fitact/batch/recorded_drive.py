@@ -25,7 +25,8 @@ from fitact.batch.recorded_tables import (
     table_nodes,
 )
 from fitact.compiled import jit, map_blocks
-from fitact.data.record import Record, rounding_noise_sd
+from fitact.data.noise import rounding_noise_sd
+from fitact.data.record import Record
 from fitact.fitting.derived import DerivedQuantities
 from fitact.fitting.least_squares import MIN_BIC_DECREASE, NUISANCES
 from fitact.fitting.residual_statistics import interpolation_errors

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from fitact import charts
 from fitact.compiled import empty_aligned
 from fitact.data.clipping import clipping_mask, replace_codes
+from fitact.data.noise import estimate_noise, rounding_noise_sd, white_noise_sd
 from fitact.data.tones import Tones, find_tones
 from fitact.errors import RATE_OPTION, InputError, channel_option
 from fitact.tables import Display, to_dataframe
@@ -128,13 +129,23 @@ class Record(Display):
             valid = np.ones(values.size, bool) if channel == "V" else ~clipping_mask(values)
             rounding, tones = rounding_noise_sd(values[valid]), self.tones if "V" in self else None
             if tones is None:
-                white = white_noise_sd(values[valid])
+                total = white_noise_sd(values[valid])
             else:  # fast ones would be taken for noise
                 rest = values - (tones if channel == "V" else tones.fit_phasors(values)).values()
-                beside = math.sqrt(max(float(np.var(rest)) - rounding**2, 0.0))
-                white = beside if channel == "V" else white_noise_sd(rest[valid])
-            self._estimates["noise", channel] = white, rounding
+                total = float(np.std(rest)) if channel == "V" else white_noise_sd(rest[valid])
+            self._estimates["noise", channel] = math.sqrt(max(total**2 - rounding**2, 0.0)), rounding
         return self._estimates["noise", channel]
+
+    def correlated_rounding(self, channel: str, least_noise: float = 1.2) -> float:
+        """Return the sd of rounding, or 0 where white noise of `least_noise` times it makes its errors independent.
+
+        They then depend on the signal by a fourteenth of their sd.
+        """
+        if ("correlated rounding", channel) not in self._estimates:
+            rounding = rounding_noise_sd(self[channel])
+            is_correlated = rounding > 0.0 and estimate_noise(self[channel]) < math.hypot(1.0, least_noise) * rounding
+            self._estimates["correlated rounding", channel] = rounding * is_correlated
+        return self._estimates["correlated rounding", channel]
 
     @functools.cached_property
     def tones(self) -> Tones | None:
@@ -227,53 +238,6 @@ def is_rounded_grid(time: Float[np.ndarray, " samples"], step: float) -> bool:
     deviation = time - step * np.arange(time.size)
     is_near = np.ptp(deviation) <= 1.1 * (largest - smallest) + 1e-2 * step
     return bool(is_near and steps.min() >= 0.0 and np.unique(np.round(steps / (1e-4 * step))).size <= time.size / 2)
-
-
-def white_noise_sd(values: Float[np.ndarray, " samples"]) -> float:
-    """Return the sd of white noise on a smooth signal, from the median of third differences (robust to edges)."""
-    return float(white_noise_sds(values))
-
-
-def white_noise_sds(values: Float[np.ndarray, "*records samples"]) -> Float[np.ndarray, "*records"]:
-    """Return `white_noise_sd` of each record; the differences are in single precision, which halves the time."""
-    third = np.diff(np.diff(values).astype(np.float32), 2)
-    np.abs(third, out=third)
-    return row_medians(third).astype(float) / 0.6744897501960817 / math.sqrt(20.0)
-
-
-def row_medians(values: Float[np.ndarray, "*rows n"]) -> Float[np.ndarray, "*rows"]:
-    """Return the median of each row, and reorder each row in place; eight times as fast as `numpy.median`."""
-    half = values.shape[-1] // 2
-    if not values.shape[-1]:
-        return np.full(values.shape[:-1], np.nan)
-    values.partition(half, axis=-1)
-    upper = values[..., half]
-    return upper if values.shape[-1] % 2 else 0.5 * (upper + np.max(values[..., :half], axis=-1))
-
-
-def rounding_noise_sd(values: Float[np.ndarray, " samples"]) -> float:
-    """Return the sd due to the resolution (LSB) of the samples, or 0 if white noise exceeds it."""
-    min_levels = 12  # fewer indicate an ideal wave, not an ADC
-    some = 65_536  # the first samples, which usually suffice
-    noise, step = white_noise_sd(values), math.inf
-    for part in (values[:some], values)[values.size <= some :]:
-        levels = np.unique(part)
-        step = float(np.diff(levels).min(initial=math.inf))
-        if step <= noise:
-            return 0.0
-    return step / math.sqrt(12.0) if levels.size >= min_levels and not _is_ramp_on_levels(values, step) else 0.0
-
-
-def _is_ramp_on_levels(values: Float[np.ndarray, " samples"], step: float) -> bool:
-    """Return whether an ideal wave has few levels because its ramps rise by the same step from sample to sample.
-
-    A converter repeats a level, or skips one, on almost any ramp.
-    """
-    changes = np.abs(np.diff(values))
-    rises = changes > 0.5 * step
-    alike = np.abs(changes[rises] - step) < 1e-3 * step
-    neighbours = rises & (np.append(rises[1:], False) | np.append(False, rises[:-1]))
-    return bool(np.mean(alike) > 0.9 and np.count_nonzero(neighbours) > 0.9 * np.count_nonzero(rises))
 
 
 def fundamental_frequency(time: Float[np.ndarray, " samples"], values: Float[np.ndarray, " samples"]) -> float | None:

@@ -102,17 +102,19 @@ class ChannelFit:
             # AR(1) noise is estimated only from the residuals
             noise = sigma if channel.noise == "ar1" else source.noise
             of_rows: dict[str, float] = {}
+            rounding_share: float | None = None
             if channel.samples.charges is not None:
-                white, of_rows = row_figures(white, channel, inputs, source.in_time)
+                white, of_rows, rounding_share = row_figures(white, channel, inputs, source.in_time)
             # a delayed response lies between the samples of V
             b = 0.0 if "delay" in channel.timing.free and channel.samples.charges is None else float(optimum.b)
             whole = white, source.record.time[counted], noise, n_fitted, _gain(optimum, channel)
-            how = source.record, channel.channel, source.choice, b
+            how = source.record, channel.channel, source.choice, b, rounding_share
             figures = channel_statistics(*whole, *how, is_curved=channel.may_curve_drive)
             figures |= of_rows
             figures |= _weighted_statistics(channel, residuals, weight, counted, source.record.time, source.noise)
             if samples.has_drive_noise:  # at edges and ends, samples of dV/dt are wrong, and rows are not
                 figures |= {"outliers": 0} | outliers(white, source.record.time[counted], source.noise)
+                figures["runs_z"] = 0.0  # V that alternates between few levels has skewed noise, whose signs differ
         return cls(
             label=channel.label,
             channel=channel.channel,

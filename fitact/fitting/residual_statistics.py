@@ -8,7 +8,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
-from fitact.data.record import Record, rounding_noise_sd, row_medians, white_noise_sds
+from fitact.data.noise import rounding_noise_sd, row_medians, white_noise_sds
+from fitact.data.record import Record
 from fitact.fitting.residual_tests import N_TESTS, PhaseBins, ResidualTestStatistics, p_values, runs_z
 from fitact.problem.drive_choice import DriveModel
 
@@ -26,6 +27,7 @@ def channel_statistics(
     channel: str,
     choice: DriveModel,
     b: float,
+    rounding_share: float | None,
     *,
     is_curved: bool,
 ) -> dict[str, float]:
@@ -34,20 +36,28 @@ def channel_statistics(
     `noise` is the model-free noise estimate of the channel. The noise of a measured drive adds to it, multiplied by
     `gain` (unit of the channel per V). At the samples of V, the response follows V but for a low-pass of it with the
     time constant `b` (s), whose interpolation is all that may be wrong, unless `b` is 0. Between the samples, V is
-    linear, or a cubic if it `is_curved`.
+    linear, or a cubic if it `is_curved`. Rounding errors that noise does not make independent have a share of the power
+    of the residuals, `rounding_share` if it is known, and structure that they can explain does not count.
     """
     measured, V = choice.name == "measured", choice.voltage
     expected = math.hypot(noise, gain * record.noise("V") if measured else 0.0)
     repeats = record.frequency() if choice.periodic else None
     count, square, bins = residuals.size, residuals @ residuals, PhaseBins.from_times(time, repeats)
-    unit = math.sqrt(square / count) or 1.0
+    unit, is_flat = math.sqrt(square / count) or 1.0, rounding_share is None  # else in proportion to the frequency
+    if rounding_share is None:
+        from_V = gain * record.correlated_rounding("V") if measured else 0.0
+        rounding_share = min((math.hypot(record.correlated_rounding(channel), from_V) / unit) ** 2, 1.0)
     # single precision suffices for the tests
     structure = ResidualTestStatistics.from_residuals((residuals / unit).astype(np.float32), bins)
+    structure = structure.without_share(rounding_share, count, with_means=is_flat)
     figures = residual_statistics(square, count, structure, np.asarray(expected), count - n_fitted, bins)
+    if rounding_share > 0.01:  # whose signs are not independent
+        figures["runs_z"] = np.zeros(())
     interpolated = float(interpolation_errors(V, white_noise_sds(V), is_curved=is_curved))
     delayed = float(np.median(np.abs(np.diff(V)))) * record.time_step / (8.0 * b) if b else math.inf
     return {name: float(value) for name, value in figures.items()} | {
         "rounding_noise": rounding_noise_sd(record[channel]),
+        "rounding_share": rounding_share,
         "interpolation_error": gain * min(interpolated, delayed) if measured else 0.0,
         "samples": count,
     }
@@ -114,9 +124,10 @@ def is_misfit(figures: Mapping[str, ArrayLike], max_excess: float = 0.1) -> Bool
     significance = -NormalDist().inv_cdf(_FALSE_ALARM)
     significant = np.expm1(significance * log_ratio_sd / np.sqrt(np.asarray(figures["degrees_of_freedom"])))
     # rounding correlates the residuals and makes the noise estimate less accurate
-    rounded = np.asarray(figures["rounding_noise"]) > 0.0
-    excess = np.asarray(figures["chi2_reduced"]) > 1.0 + np.maximum(np.where(rounded, 1.0, max_excess), significant)
-    return excess | (is_structured(figures) & ~rounded) | is_undersampled(figures)
+    rounded = np.where(np.asarray(figures["rounding_noise"]) > 0.0, 1.0, figures.get("rounding_share", 0.0))
+    allowed = np.maximum(np.maximum(rounded, max_excess), significant)
+    excess = np.asarray(figures["chi2_reduced"]) > 1.0 + allowed
+    return excess | is_structured(figures) | is_undersampled(figures)
 
 
 def is_structured(figures: Mapping[str, ArrayLike], min_runs_z: float = -6.0) -> Bool[np.ndarray, "*records"]:

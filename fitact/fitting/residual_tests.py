@@ -66,6 +66,18 @@ class ResidualTestStatistics(NamedTuple):
         folded = _fold_fractions(residuals, phase_bins)
         return cls(xp.count_nonzero(positive, axis=-1), runs, folded, *_periodogram_statistics(residuals))
 
+    def without_share(self, share: float, samples: int, *, with_means: bool) -> "ResidualTestStatistics":
+        """Return the statistics without the most that a part of the residuals with this share of the power explains.
+
+        Without `with_means`, the part is so fast that it hardly changes means over parts of a period.
+        """
+        xp, lines = array_module(self.distance), (samples - 1) // 2
+        return self._replace(
+            fold_fractions=xp.maximum(self.fold_fractions - share * with_means, 0.0),
+            distance=xp.maximum(self.distance - share * math.sqrt(lines), 0.0),
+            line_fraction=xp.maximum(self.line_fraction - share, 0.0),
+        )
+
 
 def sum_rows(values: Float[Array, "*rows n"]) -> Float[Array, "*rows"]:
     """Return the sums of rows; XLA vectorises this product with ones, but not a sum."""

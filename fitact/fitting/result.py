@@ -11,7 +11,8 @@ from jaxtyping import Float
 
 from fitact import charts, result_text, summary
 from fitact.data.kramers_kronig import KramersKronig
-from fitact.data.record import Record, rounding_noise_sd
+from fitact.data.noise import estimate_noise, rounding_noise_sd
+from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
 from fitact.experiment.fisher import Experiment
 from fitact.fitting import derived
@@ -35,7 +36,6 @@ from fitact.model.circuit import FINGER_PARAMETERS
 from fitact.model.force import ForceModel
 from fitact.model.skin import circuit_parameters, constant_skin_circuit
 from fitact.problem.drive_choice import DriveModel
-from fitact.problem.recorded_current import estimate_noise
 from fitact.problem.source import require_record
 from fitact.scene.assumptions import list_assumptions
 from fitact.scene.scene import Scene

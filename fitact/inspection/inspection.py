@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitact.data.clipping import clipping_mask, has_flat_levels
+from fitact.data.noise import rounding_noise_sd, white_noise_sd
 from fitact.data.record import (
     CHANNEL_UNITS,
     LARGEST_VALUES,
@@ -19,8 +20,6 @@ from fitact.data.record import (
     fundamental_frequency,
     grid_notes,
     is_uniform,
-    rounding_noise_sd,
-    white_noise_sd,
 )
 from fitact.errors import InputError
 from fitact.inspection.preview import describe_rows, guess_command

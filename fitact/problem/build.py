@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float
 
 from fitact.compiled import MAX_PADDED_LENGTH, as_arrays, pad_samples, pad_weight
 from fitact.data.clipping import clipping_mask, describe_clipping
-from fitact.data.record import Record, rounding_noise_sd
+from fitact.data.noise import rounding_noise_sd
+from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
 from fitact.errors import InputError
 from fitact.experiment.blind_directions import STRAY

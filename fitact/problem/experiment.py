@@ -5,6 +5,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from fitact.data.noise import estimate_noise
 from fitact.data.record import Record
 from fitact.data.spectrum import Spectrum
 from fitact.experiment.blind_directions import STRAY, gain_names
@@ -15,7 +16,6 @@ from fitact.model.drive import Sampled
 from fitact.model.skin import circuit_parameters
 from fitact.problem.build import Problem
 from fitact.problem.drive_choice import whole_periods
-from fitact.problem.recorded_current import estimate_noise
 
 
 def experiment_from_problem(

@@ -19,7 +19,8 @@ from jaxtyping import Bool, Float
 
 from fitact.compiled import pad_samples
 from fitact.data.clipping import clipping_mask
-from fitact.data.record import Record, rounding_noise_sd, white_noise_sd
+from fitact.data.noise import estimate_noise, rounding_noise_sd, white_noise_sd
+from fitact.data.record import Record
 from fitact.data.tones import Tones
 from fitact.errors import InputError
 from fitact.likelihood.channel import ChannelLikelihood
@@ -38,7 +39,7 @@ from fitact.likelihood.smooth_drive import lasting_bend, second_differences, smo
 from fitact.model.circuit import gain_at
 from fitact.model.drive import Sampled
 from fitact.problem.jumps import Jumps
-from fitact.problem.runs import RoundedSteps, Rows, least_step, long_run_share
+from fitact.problem.runs import RoundedSteps, Rows, least_step, long_run_share, run_lengths
 
 
 class Current(NamedTuple):
@@ -229,15 +230,26 @@ class RecordedCurrent:
         return scipy.fft.irfft(lines, white.size)
 
     def _noise_power(self, cycles: Rows, modelled: Current) -> Rows:
-        """Return the power of the noise of rows over the assumed one, at frequencies in cycles per step."""
+        """Return the power of the noise of rows over the assumed one, by frequency in cycles per step."""
+        from_I, from_V = self._noise_powers(cycles, modelled, float(np.median(self.variance_V)))
+        assumed = self._floor**2 * (ROW_NOISE + (1.0 - ROW_NOISE) * np.cos(2.0 * math.pi * cycles)) + from_V
+        return (from_I + from_V) / assumed
+
+    def _noise_powers(self, cycles: Rows, modelled: Current, variance_V: float) -> tuple[Rows, Rows]:
+        """Return the power of rows (A^2) from noise of I, and of V with a variance, by frequency in cycles per step."""
         impulse, turns = np.zeros(64), 2.0 * math.pi * cycles
         impulse[32 - LAG] = 1.0
         taps = np.flatnonzero(own := step_means(impulse, modelled.delay))
         early, late = modelled.sample_gains(self.step)
-        driven = float(np.median(self.variance_V))
-        floor, others = self._floor**2, driven * (early**2 + late**2 + 2.0 * early * late * np.cos(turns))
-        assumed = floor * (ROW_NOISE + (1.0 - ROW_NOISE) * np.cos(turns)) + others
-        return (floor * np.abs(np.exp(-1j * np.outer(turns, taps)) @ own[taps]) ** 2 + others) / assumed
+        gain_V = early**2 + late**2 + 2.0 * early * late * np.cos(turns)
+        from_I = self._floor**2 * np.abs(np.exp(-1j * np.outer(turns, taps)) @ own[taps]) ** 2
+        return from_I, variance_V * gain_V
+
+    def rounding_share(self, modelled: Current, rounding: float) -> float:
+        """Return the share of a `rounding` of V (V) in the power of rows, at the frequency where it is largest."""
+        variance = float(np.median(self.variance_V))
+        from_I, from_V = self._noise_powers(np.linspace(0.0, 0.5, 129), modelled, max(variance, rounding**2))
+        return float(np.max(from_V / (from_I + from_V))) * rounding**2 / (max(variance, rounding**2) or 1.0)
 
     def step_means(self, modelled: Current) -> tuple[Rows, Rows]:
         """Return the rows of the mean current over each step, and their variance beyond that of noise, A^2."""
@@ -341,48 +353,32 @@ def thin_rows(rows: np.ndarray, several: int) -> np.ndarray:
     return rows[..., 2 * LAG : 2 * LAG + several * count].reshape(*rows.shape[:-1], count, several).mean(axis=-1)
 
 
-def estimate_noise(values: Rows, block: int = 16, max_ratio: float = 0.7) -> float:
-    """Return the sd of white noise and rounding: that of sixth differences, or of the highest frequencies if far lower.
-
-    Fast smooth signals hardly change the second, which is less accurate. Blocks with edges, above 2.5 times the median,
-    are left out, and the mean square within a block counts rounding, with which a median of differences takes few
-    values.
-    """
-    squares = np.diff(values, 6) ** 2 / 924.0
-    means = squares[: squares.size // block * block].reshape(-1, block).mean(axis=1)
-    # mean square of white noise in blocks of 16 up to 2.5 times their median, over that of all, from simulations
-    kept = means[means <= 2.5 * np.median(means)] if means.size else means
-    differences = math.sqrt(float(np.mean(kept)) / 0.9099) if kept.size else white_noise_sd(values)
-    lines = scipy.fft.rfft((values - values.mean()) * np.hanning(values.size))[int(0.4 * values.size) :]
-    fastest = math.sqrt(float(np.median(np.abs(lines) ** 2)) / math.log(2.0) / (0.375 * values.size))
-    return max(fastest if fastest < max_ratio * differences else differences, rounding_noise_sd(values))
-
-
-def drive_variance(V: Rows, white: float, rounding: float) -> Rows:
+def drive_variance(V: Rows, white: float, rounding: float, long: int = 64) -> Rows:
     """Return the variance of each sample of V.
 
-    Within a run of equal values, rounding is no noise, but an offset, unless noise of a seventh of a step changes it.
+    Within a run of more than `long` equal values, rounding is no noise, but an offset, unless noise of a seventh of a
+    step changes it. Within shorter ones, as of a ramp, it grows and falls about as often as noise does.
     """
     alike = (np.diff(V) == 0.0) & (white < 0.5 * rounding)
-    within = np.append(False, alike) & np.append(alike, False)
+    within = np.append(False, alike) & np.append(alike, False) & (run_lengths(V) > long)
     return white**2 + np.where(within, 0.0, rounding**2)
 
 
 def row_figures(
     white: Rows, channel: ChannelLikelihood, inputs: ChannelInputs, record: Record
-) -> tuple[Rows, dict[str, float]]:
+) -> tuple[Rows, dict[str, float], float]:
     """Return whitened rows without the spectrum of their own (`RecordedCurrent.flatten`), and figures of merit.
 
-    Signs of rounded noise are not independent, and the covariance knows the rounding.
+    The covariance knows the rounding of I. Returns also the share of the rounding of V in the power of these rows, at
+    the frequency where it is largest.
     """
-    current = RecordedCurrent.from_record(record)
+    current, modelled = RecordedCurrent.from_record(record), Current.from_channel(channel, inputs)
     figures = {
-        "runs_z": 0.0,
         "rounding_noise": 0.0,
         "within_steps": float(current.is_within_steps),
-        "rounding_V": current.noise_V[1] if current.noise_V[0] < current.noise_V[1] else 0.0,
+        "rounding_V": record.correlated_rounding("V"),
     }
-    return current.flatten(white, Current.from_channel(channel, inputs)), figures
+    return current.flatten(white, modelled), figures, current.rounding_share(modelled, figures["rounding_V"])
 
 
 def solve_linear(

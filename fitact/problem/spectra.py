@@ -170,7 +170,7 @@ def spectrum_statistics(white: Float[np.ndarray, " samples"], n_fitted: float) -
         "structure_z": z,
         "spectrum_p": 0.5 * math.erfc(z / math.sqrt(2.0)),
         **dict.fromkeys(("folded_p", "line_p"), 1.0),
-        **dict.fromkeys(("runs_z", "rounding_noise", "interpolation_error", "outliers"), 0.0),
+        **dict.fromkeys(("runs_z", "rounding_noise", "rounding_share", "interpolation_error", "outliers"), 0.0),
         "samples": 2 * n,
         "degrees_of_freedom": freedom,
     }

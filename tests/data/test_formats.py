@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fitact
-from fitact.data.record import white_noise_sd
+from fitact.data.noise import white_noise_sd
 from fitact.readers.read import write_csv
 
 Rows = list[list[str]]

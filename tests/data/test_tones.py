@@ -5,7 +5,7 @@ import pytest
 import scipy.signal
 
 import fitact
-from fitact.data.record import rounding_noise_sd
+from fitact.data.noise import rounding_noise_sd
 from fitact.data.tones import find_tones
 
 # amplitude (V) and frequency (cycles per sample) of each tone

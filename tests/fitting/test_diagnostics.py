@@ -1,5 +1,7 @@
 """Residual tests: no alarms for correct models, alarms for a second skin layer. The references are from scipy."""
 
+import math
+
 import numpy as np
 import pytest
 import scipy.optimize
@@ -7,7 +9,7 @@ import scipy.signal
 import scipy.stats
 
 import fitact
-from fitact.data.record import white_noise_sds
+from fitact.data.noise import white_noise_sds
 from fitact.fitting.residual_statistics import is_misfit, outliers
 from fitact.fitting.residual_tests import PhaseBins, ResidualTestStatistics, p_values
 
@@ -75,6 +77,21 @@ def residual_p_values(
     """Return the p-values of residuals, by default in the precision that fits use."""
     of_time = PhaseBins.from_times(time, frequency)
     return p_values(ResidualTestStatistics.from_residuals(residuals.astype(precision), of_time), time.size, of_time)
+
+
+def test_structure_that_rounding_explains_does_not_count():
+    """A ramp in steps above its noise, with more; rounding has a third of the power, and a sine would have another."""
+    k, rng = np.arange(6000), np.random.default_rng(5)
+    ramp = 0.1 * np.abs((k + 1500) % 3000 - 1500.0) + 0.1 * rng.standard_normal(k.size)
+    residuals = ramp - np.round(ramp) + 0.4 * rng.standard_normal(k.size)
+
+    def line_p(values: np.ndarray, rounding: float = 1.0 / math.sqrt(12.0)) -> float:
+        statistics, share = ResidualTestStatistics.from_residuals(values, None), rounding**2 / np.mean(values**2)
+        return float(p_values(statistics.without_share(share, k.size, with_means=False), k.size, None)["line_p"])
+
+    assert line_p(residuals, 0.0) < 1e-9
+    assert line_p(residuals) > 1e-3
+    assert line_p(residuals + 0.5 * np.sin(2.0 * np.pi * k / 12.0)) < 1e-9
 
 
 def test_false_alarms_of_white_noise_are_as_many_as_stated():
