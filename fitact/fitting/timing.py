@@ -16,7 +16,7 @@ from fitact.likelihood.channel import ChannelLikelihood
 from fitact.likelihood.likelihood import CircuitValues, Likelihood
 from fitact.likelihood.noise import student_weight
 from fitact.likelihood.observable import TIMING_NUISANCES, ChannelInputs
-from fitact.likelihood.smooth_drive import curve_drive, curve_tones
+from fitact.likelihood.smooth_drive import corner_errors, curve_drive, curve_tones
 from fitact.model.drive import Sampled
 from fitact.model.response import highpass
 from fitact.model.skin import constant_skin_circuit, limits_current
@@ -114,11 +114,13 @@ def curve_drives(
     sigma: Float[np.ndarray, " channels"],
     sources: Sequence[Source],
     max_change: float = 0.3,
+    max_excluded: float = 0.25,
 ) -> Likelihood:
     """Return the likelihood in which recorded drives, linear between samples, are cubic for a delay by part of a step.
 
-    Between two samples, a line misses a curve by part (1 - part) / 2 of its second differences, which are added. The
-    likelihood is the same if no Vsc changes by more than `max_change` standard errors.
+    Between two samples, a line misses a curve by part (1 - part) / 2 of its second differences, which are added.
+    Samples that read V at a corner, where it misses by more than half of their noise, are excluded. The likelihood is
+    the same if none are, and no Vsc changes by more than `max_change` standard errors.
     """
     for i, (channel, source) in enumerate(zip(likelihood.channels, sources, strict=True)):
         if not channel.may_curve_drive:
@@ -129,7 +131,7 @@ def curve_drives(
         assert isinstance(drive, Sampled)
         assert smooth is not None
         late = theta[likelihood.names.index(channel.qualified_name("delay"))]
-        step, lag = float(channel.timing.step), 0.0
+        step, lag, at_corner = float(channel.timing.step), 0.0, np.zeros(len(record), bool)
         late += float(channel.timing.shift) / step
         if record.tones is not None:
             terms = likelihood.evaluate_circuit(theta).terms[channel.channel]
@@ -138,6 +140,11 @@ def curve_drives(
             if limits_current(likelihood.template):  # whose resistance makes Vsc later, too
                 lag = min(float(likelihood.evaluate_circuit(theta).tau[-1]) / step, 1.0)
             curved = curve_drive(smooth[: len(record)], late, lag)
+            missed = abs(float(electrical.noise_gain)) * corner_errors(smooth[: len(record)], late, lag)
+            at_corner = (missed > 0.5 * source.noise) & (channel.samples.weights[: len(record)] > 0.0)
+        if 0.0 < np.mean(at_corner) < max_excluded:
+            channel = channel.without_compression().exclude_samples(np.pad(at_corner, (0, now.size - at_corner.size)))
+            likelihood = likelihood.replace_channel(i, channel)
         curved = pad_samples(curved)
         changes = np.asarray(electrical.noise_gain) * (curved - now) / sigma[i]
         if np.linalg.norm(changes * np.sqrt(channel.samples.weights)) > max_change:

@@ -49,11 +49,25 @@ def second_differences(V: Any) -> Any:
 
 
 def lasting_bend(V: Any) -> Any:
-    """Return the second differences of V (samples) without those of single corners: medians of three."""
+    """Return the second differences of V (samples) without those of corners: medians of three, 0 at `find_corners`."""
     xp = array_module(V)
     bend = xp.pad(second_differences(V), 1)
     before, here, after = bend[:-2], bend[1:-1], bend[2:]
-    return xp.maximum(xp.minimum(before, after), xp.minimum(xp.maximum(before, after), here))
+    median = xp.maximum(xp.minimum(before, after), xp.minimum(xp.maximum(before, after), here))
+    starts = find_corners(V)
+    return xp.where(starts | xp.pad(starts, (1, 0))[:-1], 0.0, median)
+
+
+def find_corners(V: Any, max_others: float = 0.125) -> Any:
+    """Return at which samples a step begins within which V (samples) has a corner.
+
+    It bends V at both samples around it, and those next to them less, by `max_others` of both together.
+    """
+    xp = array_module(V)
+    bend = xp.pad(second_differences(V), (1, 2))
+    before, first, second, after = bend[:-3], bend[1:-2], bend[2:-1], bend[3:]
+    others = xp.maximum(abs(before), abs(after))
+    return (first * second > 0.0) & (others < max_others * abs(first + second))
 
 
 def curve_drive(smooth: Any, late: float, lag: float = 0.0) -> Any:
@@ -61,8 +75,26 @@ def curve_drive(smooth: Any, late: float, lag: float = 0.0) -> Any:
 
     A low-pass with the time constant `lag` (time steps) reads the drive later by an exponential distribution.
     """
-    lates = late - lag * np.log1p(-(np.arange(16) + 0.5) / 16.0) if lag else np.array([late])
-    return smooth + np.mean(missing_curve(lates)) * lasting_bend(smooth)
+    return smooth + np.mean(missing_curve(_spread(late, lag))) * lasting_bend(smooth)
+
+
+def corner_errors(smooth: Any, late: float, lag: float = 0.0) -> Any:
+    """Return by how much (V) lines between samples of a smooth drive miss its corners, where each sample reads it.
+
+    A corner at the part x of a step bends the drive by 1 - x and x of its own bend at the two samples around it. At the
+    part p, where a response that is `late` (time steps) reads it, the line is off by the lesser of p times the first
+    and 1 - p times the second. `lag`: see `curve_drive`.
+    """
+    xp, bend, total = array_module(smooth), second_differences(smooth), 0.0
+    before, after = abs(bend) * find_corners(smooth), xp.roll(abs(bend), -1)
+    for steps, part in zip(*np.divmod(-_spread(late, lag), 1.0), strict=True):
+        total = total + xp.roll(xp.sign(bend) * xp.minimum(part * before, (1.0 - part) * after), -int(steps))
+    return abs(total) / _spread(late, lag).size
+
+
+def _spread(late: float, lag: float) -> Float[np.ndarray, " lates"]:
+    """Return delays (time steps) that represent the distribution of a `late` one behind a low-pass."""
+    return late - lag * np.log1p(-(np.arange(16) + 0.5) / 16.0) if lag else np.array([late])
 
 
 def curve_tones(tones: Tones, late: float, terms: HighpassTerms, step: float = 1.0) -> Float[np.ndarray, " samples"]:

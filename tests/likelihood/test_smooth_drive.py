@@ -7,7 +7,14 @@ import scipy.signal
 
 import fitact
 from fitact.data.tones import Tones
-from fitact.likelihood.smooth_drive import curve_drive, curve_tones, lasting_bend, missing_curve, smooth_drive
+from fitact.likelihood.smooth_drive import (
+    corner_errors,
+    curve_drive,
+    curve_tones,
+    lasting_bend,
+    missing_curve,
+    smooth_drive,
+)
 from fitact.model.loop_modes import HighpassTerms
 
 STEP, FINE = 6.25e-6, 8  # s, and fine steps of the truth in a step
@@ -94,6 +101,8 @@ def record(
     V = np.clip(5.0 * V, -180.0, 180.0) if waveform == "trapezoid" else V
     V = 90.0 * (np.sin(turns) + np.sin(41.0 * turns)) if waveform == "tones" else V
     V = 90.0 * np.sin(100.0 * turns) * (1.0 - np.cos(turns)) if waveform == "carrier" else V
+    if waveform == "corners":  # edges of 16 steps, which begin and end within one
+        V = np.clip(9000.0 * scipy.signal.sawtooth(turns + 2.0 * np.pi * 37.5 * STEP, 0.5), -180.0, 180.0)
     if waveform == "slewed":  # edges of 16 steps, with a pole of 3
         pole = np.exp(-1.0 / (3 * FINE))
         V = scipy.signal.lfilter([1.0 - pole], [1.0, -pole], np.clip(50.0 * V, -180.0, 180.0))
@@ -144,8 +153,32 @@ def test_a_curved_drive_lies_on_the_curve_between_samples_and_corners_stay(late:
     curved = sine + missing_curve(late) * lasting_bend(sine)
     missed, left = (np.interp(k - late, k, each) - np.sin(0.3 * (k - late)) for each in (sine, curved))
     assert np.max(np.abs(left[5:-5])) < 0.1 * np.max(np.abs(missed[5:-5]))
-    for corners in (np.abs(k - 100.0), np.clip(k - 100.0, 0.0, 2.0), 1.0 * (k > 100.0)):
+    for corners in (np.abs(k - 100.0), np.abs(k - 100.4), np.clip(k - 100.0, 0.0, 2.0), 1.0 * (k > 100.0)):
         assert not lasting_bend(corners).any()
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.4])
+@pytest.mark.parametrize("late", [0.1, -0.5, 1.7])
+def test_corners_between_samples_are_missed_by_so_much(late: float, lag: float):
+    """Straight edges less the lines between their samples, behind a low-pass by SciPy, which 16 delays stand for."""
+    k, steps = np.arange(60.0), np.arange(0.0, 59.0, 1.0 / 400)
+    V, exact = (np.interp(each, [10.3, 20.8, 35.15, 47.9], [0.0, 90.0, 90.0, -90.0]) for each in (k, steps))
+    missed = exact - np.interp(steps, k, V)
+    if lag:
+        missed = scipy.signal.lsim(([1.0], [lag, 1.0]), missed, steps)[1]
+    read = np.abs(np.interp(k - late, steps, missed))
+    np.testing.assert_allclose(corner_errors(V, late, lag)[4:-4], read[4:-4], atol=(0.07 if lag else 0.01) * read.max())
+
+
+@pytest.mark.parametrize(("skew", "bits"), [(3, 14), (12, 10)])
+def test_samples_that_read_corners_between_samples_are_left_out(skew: int, bits: int):
+    """Eight were outliers, and the residuals of 14 bits had structure."""
+    fit = fitact.fit(record(0, skew, 0.1, 0.005, bits, "corners"), SCENE)
+    b, found = SKIN[0] * (2.0 * SKIN[2] + SKIN[1]), fit.derived()["b"]
+    assert fit.result == "successful"
+    assert fit.figures["outliers"] == 0
+    assert abs(np.log(found["q50"] / b)) < 4.0 * found["sd"] / found["mean"]
+    assert fit.figures["samples"] > 0.99 * 3200
 
 
 @pytest.mark.parametrize("skew", [3, 4, 13])
