@@ -376,9 +376,10 @@ def row_figures(
     figures = {
         "rounding_noise": 0.0,
         "within_steps": float(current.is_within_steps),
-        "rounding_V": record.correlated_rounding("V"),
+        "rounding_V": current.noise_V[1] if current.noise_V[0] < current.noise_V[1] else 0.0,
     }
-    return current.flatten(white, modelled), figures, current.rounding_share(modelled, figures["rounding_V"])
+    share = current.rounding_share(modelled, record.correlated_rounding("V"))
+    return current.flatten(white, modelled), figures, share
 
 
 def solve_linear(
