@@ -39,7 +39,7 @@ from fitact.likelihood.smooth_drive import lasting_bend, second_differences, smo
 from fitact.model.circuit import gain_at
 from fitact.model.drive import Sampled
 from fitact.problem.jumps import Jumps
-from fitact.problem.runs import RoundedSteps, Rows, least_step, long_run_share, run_lengths
+from fitact.problem.runs import RoundedSteps, Rows, least_step, long_run_share
 
 
 class Current(NamedTuple):
@@ -353,14 +353,14 @@ def thin_rows(rows: np.ndarray, several: int) -> np.ndarray:
     return rows[..., 2 * LAG : 2 * LAG + several * count].reshape(*rows.shape[:-1], count, several).mean(axis=-1)
 
 
-def drive_variance(V: Rows, white: float, rounding: float, long: int = 64) -> Rows:
+def drive_variance(V: Rows, white: float, rounding: float, settling: int = 32) -> Rows:
     """Return the variance of each sample of V.
 
-    Within a run of more than `long` equal values, rounding is no noise, but an offset, unless noise of a seventh of a
-    step changes it. Within shorter ones, as of a ramp, it grows and falls about as often as noise does.
+    Within a run of equal values, rounding is no noise, but an offset, unless noise of a seventh of a step changes it.
+    So near its ends as `settling` samples it changes: on a ramp, and where V settles within the last step.
     """
-    alike = (np.diff(V) == 0.0) & (white < 0.5 * rounding)
-    within = np.append(False, alike) & np.append(alike, False) & (run_lengths(V) > long)
+    alike = np.pad(np.diff(V) == 0.0, (1, 0)) & (white < 0.5 * rounding)
+    within = scipy.ndimage.minimum_filter1d(alike, 2 * settling + 1, mode="nearest")
     return white**2 + np.where(within, 0.0, rounding**2)
 
 

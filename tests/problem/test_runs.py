@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from fitact.problem.recorded_current import drive_variance
 from fitact.problem.runs import RoundedSteps, least_step, run_lengths
 
 
@@ -61,3 +62,14 @@ def test_runs_and_least_step():
     assert least_step(np.repeat(values, 4)) == 1.0
     assert least_step(np.arange(9.0) ** 2) == 0.0
     assert math.isclose(least_step(np.repeat([0.0, 0.25, 1.0], 40)), 0.25)
+
+
+def test_rounding_of_V_is_an_offset_on_plateaus_only():
+    """Not on a ramp of four samples a step, nor where V settles: there, I followed what V did not show, 60 sd away."""
+    k = np.arange(800.0)
+    V = np.round(np.minimum(0.25 * k, 100.0 - 3.0 * np.exp(-np.maximum(k - 388.0, 0.0) / 4.0)))
+    white, rounding = 0.1, 1.0 / np.sqrt(12.0)
+    variance = drive_variance(V, white, rounding)
+    np.testing.assert_allclose(variance[:430], white**2 + rounding**2)
+    np.testing.assert_allclose(variance[500:], white**2)
+    np.testing.assert_allclose(drive_variance(V, rounding, rounding), 2.0 * rounding**2)
