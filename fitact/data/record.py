@@ -141,11 +141,9 @@ class Record(Display):
 
         They then depend on the signal by a fourteenth of their sd.
         """
-        if ("correlated rounding", channel) not in self._estimates:
-            rounding = rounding_noise_sd(self[channel])
-            is_correlated = rounding > 0.0 and estimate_noise(self[channel]) < math.hypot(1.0, least_noise) * rounding
-            self._estimates["correlated rounding", channel] = rounding * is_correlated
-        return self._estimates["correlated rounding", channel]
+        _, rounding = self.noise_parts(channel)
+        is_correlated = rounding > 0.0 and estimate_noise(self[channel]) < math.hypot(1.0, least_noise) * rounding
+        return rounding if is_correlated else 0.0
 
     @functools.cached_property
     def tones(self) -> Tones | None:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitact.compiled import jit, pad_rows, pad_samples
+from fitact.compiled import jit, pad_rows, pad_samples, pad_weight
 from fitact.fitting.score_test import explained_squares, orthonormalise
 from fitact.likelihood.certificate import recompress
 from fitact.likelihood.channel import ChannelLikelihood
@@ -131,7 +131,7 @@ def curve_drives(
         assert isinstance(drive, Sampled)
         assert smooth is not None
         late = theta[likelihood.names.index(channel.qualified_name("delay"))]
-        step, lag, at_corner = float(channel.timing.step), 0.0, np.zeros(len(record), bool)
+        step, lag = float(channel.timing.step), 0.0
         late += float(channel.timing.shift) / step
         if record.tones is not None:
             terms = likelihood.evaluate_circuit(theta).terms[channel.channel]
@@ -142,9 +142,9 @@ def curve_drives(
             curved = curve_drive(smooth[: len(record)], late, lag)
             missed = abs(float(electrical.noise_gain)) * corner_errors(smooth[: len(record)], late, lag)
             at_corner = (missed > 0.5 * source.noise) & (channel.samples.weights[: len(record)] > 0.0)
-        if 0.0 < np.mean(at_corner) < max_excluded:
-            channel = channel.without_compression().exclude_samples(np.pad(at_corner, (0, now.size - at_corner.size)))
-            likelihood = likelihood.replace_channel(i, channel)
+            if 0.0 < np.mean(at_corner) < max_excluded:
+                channel = channel.without_compression().exclude_samples(pad_weight(at_corner))
+                likelihood = likelihood.replace_channel(i, channel)
         curved = pad_samples(curved)
         changes = np.asarray(electrical.noise_gain) * (curved - now) / sigma[i]
         if np.linalg.norm(changes * np.sqrt(channel.samples.weights)) > max_change:

@@ -305,9 +305,9 @@ def certify(
     middle, factor = from_elements(theta, places), differentiate(theta, places) @ covariance_factor
     around = np.vstack([theta, to_elements(middle + 1.5 * deviates[:check_points] @ factor.T, places)])
     is_local = any(channel.expansion is not None for channel in likelihood.channels)
-    points = (
-        around if is_local else np.vstack([around, draw_within_tables(light, theta, check_points - 1)])
-    )  # fills a batch
+    points = around
+    if not is_local:  # fills a batch
+        points = np.vstack([around, draw_within_tables(light, theta, check_points - 1)])
     narrow = dataclasses.replace(likelihood, channels=restricted).without_samples()
     exact, compressed, tabulated = _evaluate_log_likelihoods(
         (likelihood.without_compression(), narrow, light), points, sigma

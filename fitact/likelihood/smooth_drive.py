@@ -85,11 +85,11 @@ def corner_errors(smooth: Any, late: float, lag: float = 0.0) -> Any:
     part p, where a response that is `late` (time steps) reads it, the line is off by the lesser of p times the first
     and 1 - p times the second. `lag`: see `curve_drive`.
     """
-    xp, bend, total = array_module(smooth), second_differences(smooth), 0.0
-    before, after = abs(bend) * find_corners(smooth), xp.roll(abs(bend), -1)
-    for steps, part in zip(*np.divmod(-_spread(late, lag), 1.0), strict=True):
+    xp, bend, lates = array_module(smooth), second_differences(smooth), _spread(late, lag)
+    before, after, total = abs(bend) * find_corners(smooth), xp.roll(abs(bend), -1), 0.0
+    for steps, part in zip(*np.divmod(-lates, 1.0), strict=True):
         total = total + xp.roll(xp.sign(bend) * xp.minimum(part * before, (1.0 - part) * after), -int(steps))
-    return abs(total) / _spread(late, lag).size
+    return abs(total) / lates.size
 
 
 def _spread(late: float, lag: float) -> Float[np.ndarray, " lates"]:

@@ -247,9 +247,11 @@ class RecordedCurrent:
 
     def rounding_share(self, modelled: Current, rounding: float) -> float:
         """Return the share of a `rounding` of V (V) in the power of rows, at the frequency where it is largest."""
-        variance = float(np.median(self.variance_V))
-        from_I, from_V = self._noise_powers(np.linspace(0.0, 0.5, 129), modelled, max(variance, rounding**2))
-        return float(np.max(from_V / (from_I + from_V))) * rounding**2 / (max(variance, rounding**2) or 1.0)
+        if rounding == 0.0:
+            return 0.0
+        variance = max(float(np.median(self.variance_V)), rounding**2)
+        from_I, from_V = self._noise_powers(np.linspace(0.0, 0.5, 129), modelled, variance)
+        return float(np.max(from_V / (from_I + from_V))) * rounding**2 / variance
 
     def step_means(self, modelled: Current) -> tuple[Rows, Rows]:
         """Return the rows of the mean current over each step, and their variance beyond that of noise, A^2."""
@@ -357,7 +359,7 @@ def drive_variance(V: Rows, white: float, rounding: float, settling: int = 32) -
     """Return the variance of each sample of V.
 
     Within a run of equal values, rounding is no noise, but an offset, unless noise of a seventh of a step changes it.
-    So near its ends as `settling` samples it changes: on a ramp, and where V settles within the last step.
+    Within `settling` samples of its ends, the offset changes: on a ramp, and where V settles within its last step.
     """
     alike = np.pad(np.diff(V) == 0.0, (1, 0)) & (white < 0.5 * rounding)
     within = scipy.ndimage.minimum_filter1d(alike, 2 * settling + 1, mode="nearest")

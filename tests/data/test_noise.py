@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import fitact
+from fitact.data.noise import estimate_noise
 
 
 @pytest.mark.parametrize("step", [0.0, 0.3, 0.8, 1.5, 2.5])
@@ -22,3 +23,4 @@ def test_noise_counts_rounding(step: float, shape: str):
     record = fitact.Record.from_arrays(time, V=signal, Vsc=values, I=1e-6 * values)
     assert record.noise("Vsc") == pytest.approx(expected, rel=0.06)
     assert record.noise("I") == pytest.approx(1e-6 * expected, rel=0.06)
+    assert estimate_noise(values) == pytest.approx(expected, rel=0.04)
